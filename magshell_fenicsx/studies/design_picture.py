@@ -97,13 +97,10 @@ def _draw_history(
     for i, result in enumerate(results):
         values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
         colour, wide = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)  # lines that lie on each other are all seen
-        axes.plot(number, values, ".", color=colour, markersize=4, alpha=0.35, markeredgewidth=0)
-        ends = (
-            [np.append(number[best], number[-1]), np.append(values[best], values[best][-1:])]
-            if best.any()
-            else [[], []]
-        )
-        axes.plot(*ends, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=_name(result))
+        axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
+        until = np.append(number[best], number[-1:] if best.any() else [])
+        reached = np.append(values[best], values[best][-1:])
+        axes.plot(until, reached, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=_name(result))
         if result in asked:
             axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":

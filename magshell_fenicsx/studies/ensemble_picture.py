@@ -80,8 +80,10 @@ def words(key: str) -> str:
 
     Examples
     --------
-    >>> words("severest.amplitude_mm"), words("severest.at.polar"), words("severest.amplitude")
-    ('amplitude of the most severe defect  (mm)', 'polar of the most severe defect  (degrees)', 'amplitude over $h$ of the most severe defect')
+    >>> words("severest.amplitude_mm"), words("severest.at.polar")
+    ('amplitude of the most severe defect  (mm)', 'polar of the most severe defect  (degrees)')
+    >>> words("severest.amplitude")
+    'amplitude over $h$ of the most severe defect'
     """
     of, _, last = key.rpartition(".")
     name, _, ending = last.rpartition("_")
