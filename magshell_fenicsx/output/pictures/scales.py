@@ -114,7 +114,7 @@ def numbers(values: Sequence[float]) -> tuple[list[str], str]:
     Examples
     --------
     >>> numbers([-0.5, 0.0, 20.04]), numbers([0.0, 1e-5, 3.412e-5])
-    ((['−0.5', '0', '20'], ''), (['0', '1', '3.41'], '$\\times 10^{-5}$'))
+    ((['−0.5', '0', '20'], ''), (['0', '1', '3.41'], '$\\\\times 10^{-5}$'))
     """
     largest = max(map(abs, values)) or 1.0
     order = int(np.floor(np.log10(largest)))
