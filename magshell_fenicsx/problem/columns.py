@@ -2,21 +2,43 @@
 
 from collections.abc import Collection
 from dataclasses import replace
+from math import isnan
+
+import numpy as np
 
 from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import seen
-from magshell_fenicsx.parts.supports.reacting import motion_columns, only_turns
+from magshell_fenicsx.parts.supports.reacting import motion_columns, motion_size, only_turns
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.quantity import TURN, WAY, Unit
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 
 def sizes_in_units(problem: Problem) -> Sizes:
     """The sizes of the case's units."""
     moments = {column for name, column in motion_columns(problem.loads).items() if only_turns(problem.loads, name)}
-    return sizes_of(problem.context, moments)
+    sizes = sizes_of(problem.context, moments)
+    return replace(sizes, ways=_ways(problem.loads, sizes.given.R) if sizes.given else {})
+
+
+def _ways(loads: Loads, R: float) -> dict[str, tuple[Unit, float]]:
+    """How far the motion of each amplitude goes at one, in mm, or turns, in degrees; R in metres, nan without units."""
+    if isnan(R):
+        return {}
+    turning = {name: only_turns(loads, name) for name in motion_columns(loads)}
+    sizes = {name: motion_size(loads, name) for name in turning}
+    for driven in loads.magnetic.driven if loads.magnetic else ():
+        for motion in driven.motions:
+            turning[motion.name] = not motion.shift.any()
+            sizes[motion.name] = float(np.linalg.norm(motion.turn if turning[motion.name] else motion.shift))
+    return {
+        name: (TURN, float(np.degrees(size))) if turning[name] else (WAY, 1e3 * R * size)
+        for name, size in sizes.items()
+        if size
+    }
 
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:

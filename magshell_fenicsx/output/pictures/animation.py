@@ -32,7 +32,10 @@ HELD = 1500  # milliseconds of the last frame
 MOST_CURVES = 4  # beside each other
 COLOURS = 128
 STYLE = OutputSection(dpi=120, font_size=9)
+WHITE = (255, 255, 255)
 FOOT = 34  # pixels below the shell
+GREY, RIM = 0.35, 0.8  # of the line around what is drawn, and how much of it is seen
+Array = NDArray[np.float64]
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
@@ -78,8 +81,9 @@ def animated(
     with drawing(STYLE):
         views = _views(surfaces, h, factor, camera)
         frames = _composed(views, factor, titles, rows, shown, pole)
+    dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
     palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
-    first, *others = (Pillow.fromarray(f).quantize(palette=palette, dither=Pillow.Dither.NONE) for f in frames)
+    first, *others = (Pillow.fromarray(frame).quantize(palette=palette, dither=dither) for frame in frames)
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
     content = io.BytesIO()
@@ -94,7 +98,8 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    palette.putpalette([c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []])
+    found = [c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []]
+    palette.putpalette([*WHITE, *found[3:]])
     return palette
 
 
@@ -165,7 +170,17 @@ def _composed(
 def _lay(image: Image, under: NDArray[np.uint8]) -> None:
     """Put an image with transparency on a part of a frame."""
     part = image[..., 3:] / 255
-    under[:] = np.rint(part * image[..., :3] + (1 - part) * under)
+    laid = part * image[..., :3] + (1 - part) * under
+    edge = RIM * _edge(part)
+    under[:] = np.rint((1 - edge) * laid + edge * 255 * GREY)
+
+
+def _edge(part: Array) -> Array:
+    """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at its rim."""
+    least = part.copy()
+    for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        least = np.minimum(least, np.roll(part, way, axis))
+    return np.asarray(part - least)
 
 
 def _scale(factor: float) -> str:
