@@ -37,6 +37,7 @@ MARKS = {"fold": "o", "bifurcation": "D"}
 MARK = 3.5  # points
 HIDDEN = 12.0  # points: an unstable part as small as this is hidden by the marks at its ends
 AROUND = 0.8  # around such a part in its inset, over its size
+STRAIGHT = 0.005  # of its extent: a curve as near as this to its chord is a straight line
 INSET = 0.4  # of the axes
 CROWDED = 0.02  # of the points of all curves: an inset that covers more has no place
 
@@ -69,7 +70,7 @@ def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, plac
             axes = figure.add_subplot(grid[high, :] if alone else grid[i // across, i % across])
             plot_curve(axes, part, place)
             axes.set_title(part.title)
-        _legend(figure, 4 * min(len(parts), 2))
+        legend(figure, 4 * min(len(parts), 2))
         figure.draw_without_rendering()  # insets need the places of the axes
         for axes, part in zip(list(figure.axes), parts, strict=True):
             draw_hidden(axes, part)
@@ -77,12 +78,19 @@ def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, plac
 
 
 def worth_drawing(parts: Sequence[Part]) -> list[Part]:
-    """The steps without those of a single straight line, unless there are no others; the last one always."""
-    curved = [part for part in parts[:-1] if len(part.rows) > 2]
-    return [*curved, parts[-1]]
+    """The steps without those of a single straight line; the last one always."""
+    return [*(part for part in parts[:-1] if _bends(part)), parts[-1]]
 
 
-def _legend(figure: "Figure", most: int) -> None:
+def _bends(part: Part) -> bool:
+    """Whether the points of a curve are on no line."""
+    x, y = np.array([place(row, part.amplitude) for row in part.rows]).T
+    wide, high = (float(np.ptp(values)) or 1.0 for values in (x, y))
+    (a, b), x, y = np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high], (x - x[0]) / wide, (y - y[0]) / high
+    return bool(len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0))
+
+
+def legend(figure: "Figure", most: int) -> None:
     """One legend above all axes, where it covers no curve."""
     entries = {name: line for axes in figure.axes for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     if entries:

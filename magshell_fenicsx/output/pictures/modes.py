@@ -90,7 +90,7 @@ def small_panels(
         figure.text(*boxes.place(left + wide / 2, low + tall + lines * line / 2), caption, ha="center", va="center")
     reach = min(width - gap - 8 * line, 4.0)
     box = boxes.axes((width - reach) / 2, 1.7 * line, reach, 0.65 * line)
-    colour_bar(figure, box, panel.scale)
+    colour_bar(figure, box, panel.scale, room=reach)
     directions(boxes.axes(gap / 2, 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
     return figure
 
@@ -124,7 +124,7 @@ def _name(row: Row) -> str:
 
 
 SHOWN = 0.05  # drawn size of a mode's largest displacement, over R
-CAPTION = "$w$ of the mode, of any size and sign, over its largest"
+CAPTION = "$w$ of the mode over its largest, of any sign"
 
 
 def modes_figure(

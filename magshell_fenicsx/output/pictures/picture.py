@@ -129,6 +129,10 @@ class Background:
         scale = Scale((low, high), layer.colours, layer.caption, beyond)
         return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts)
 
+    def plain(self, grey: float) -> Image:
+        """The shell in one grey, with what is beside it."""
+        return self._whole(self.seen.plain(grey))
+
     def _whole(self, image: Image) -> Image:
         """An image of the shell with what is beside it."""
         for laid in self._beside.laid:

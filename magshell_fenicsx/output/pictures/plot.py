@@ -14,11 +14,12 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure
+from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
 from magshell_fenicsx.output.pictures.layout import drawing, written
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.view import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
@@ -72,7 +73,11 @@ class Drawn:
 
 
 def plot(
-    folder: Path, point: int | None = None, animation: bool = False, options: Mapping[str, Any] | None = None
+    folder: Path,
+    point: int | None = None,
+    animation: bool = False,
+    options: Mapping[str, Any] | None = None,
+    shapes: Sequence[int] = (),
 ) -> list[str]:
     """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
 
@@ -80,7 +85,7 @@ def plot(
     """
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
-    drawn = draw(folder, point, options)
+    drawn = draw(folder, point, options, shapes)
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
@@ -90,7 +95,28 @@ def plot(
     return drawn
 
 
-def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | None = None) -> list[str]:
+def plot_runs(folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None) -> list[str]:
+    """Draw the curves of several runs in one picture; the names of its files.
+
+    Raises
+    ------
+    CaseError
+        If a folder has no run, or the curves do not belong together.
+    OSError
+        If a file cannot be written.
+    """
+    runs = {folder: _rows(folder) for folder in folders}
+    style = style_of(case_in(folders[0]), options)
+    names = []
+    for name, content in written(runs_figure(runs, style), style, file.stem):
+        write_whole(file.parent / name, content)
+        names.append(str(file.parent / name))
+    return names
+
+
+def draw(
+    folder: Path, point: int | None = None, options: Mapping[str, Any] | None = None, shapes: Sequence[int] = ()
+) -> list[str]:
     """Draw every picture of a finished or interrupted run.
 
     Parameters
@@ -99,6 +125,8 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
         Draw only this point: shell_0007.png, strains_0007.png, ...
     options
         Keys of the section `output` in place of those of the case.
+    shapes
+        Points whose shells are put on the curve.
 
     Returns
     -------
@@ -114,8 +142,11 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
     run = Drawn(folder, options)
     if point is not None and not 0 <= point < len(run.rows):
         raise CaseError(f"--point {point}: {folder} has points 0 to {len(run.rows) - 1}")
+    for number in shapes:
+        if not 0 <= number < len(run.rows):
+            raise CaseError(f"--shapes {number}: {folder} has points 0 to {len(run.rows) - 1}")
     names = []
-    for name, content in _of_point(run, point) if point is not None else _of_run(run):
+    for name, content in _of_point(run, point) if point is not None else _of_run(run, shapes):
         write_whole(folder / name, content)
         names.append(name)
     return names
@@ -129,11 +160,17 @@ def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
         yield from written(figure, run.style, f"{name}_{point:04d}")
 
 
-def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
+def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
     style, last = run.style, run.on_path[-1]
     surface, about = run.at(run.headline)
     if amplitude := str(last["amplitude"]):
-        yield from written(curve_figure(run.rows, amplitude, style, run.place), style, "curve")
+        curve = curve_figure(run.rows, amplitude, style, run.place)
+        if shapes:
+            with drawing(style):
+                shells = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
+                parts = worth_drawing(drawn_parts(run.rows, amplitude))
+                add_shapes(curve, parts, shells, style, run.camera)
+        yield from written(curve, style, "curve")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
