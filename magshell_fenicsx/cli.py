@@ -308,6 +308,7 @@ def plot(
     shapes: Annotated[
         str | None, typer.Option(metavar="N,N", help="put the shell at these points on the curve")
     ] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")] = False,
     out: Annotated[Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")] = Path(
         "curves.png"
     ),
@@ -334,11 +335,11 @@ def plot(
     with exit_codes(stopped=(OSError,)):
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
         if len(folders) > 1:
-            if point is not None or animation or shapes:
+            if point is not None or animation or shapes or whole:
                 raise CaseError("plot: of several runs the curves are drawn in one picture: give one folder for more")
             print_line(", ".join(plot_runs(folders, out, options)))
             return
-        drawn = plot_again(folders[0], point, animation, options, points_of(shapes))
+        drawn = plot_again(folders[0], point, animation, options, points_of(shapes), whole)
     print_line(f"{', '.join(drawn)} in {folders[0]}/")
 
 

@@ -11,13 +11,14 @@ import basix
 import matplotlib.image
 import numpy as np
 import pytest
+import pyvista
 from dolfinx.cpp.io import perm_vtk
 from dolfinx.mesh import CellType
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface, completed
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
@@ -36,7 +37,7 @@ from magshell_fenicsx.output.pictures.view import (
     towards,
 )
 from magshell_fenicsx.output.store.known import pole_of
-from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, PathTable, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
@@ -344,6 +345,11 @@ def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert same.fields.keys() == surface.fields.keys()
     for name, values in surface.fields.items():
         assert (same.fields[name] == values).all()
+    grid = pyvista.read(tmp_path / point_file(0))
+    assert np.asarray(grid.points) == pytest.approx(surface.r0)
+    warped = grid.warp_by_vector("u")
+    assert np.asarray(warped.points) == pytest.approx(surface.r0 + surface.u)
+    assert {"u: R", "u_over_h: h", "E: 1", "k: h E lambda_m"} <= set(grid.field_data["units"])
     whole = completed(same, mirror)
     assert whole.fields["E"][4:] == pytest.approx(_mirrored(surface.fields["E"], mirror))
 
@@ -351,3 +357,29 @@ def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
 def _mirrored(T: Array, m: Array) -> Array:
     Q = np.eye(3) - 2 * np.outer(m, m)
     return np.einsum("ai,nij,bj->nab", Q, T, Q)
+
+
+def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path) -> None:
+    """The pressure where it rises, the points where it turns back; a half and its image in one file."""
+    mirror, surface = np.array([0.0, 1.0, 0.0]), plate(0.1)
+    surface = replace(surface, r0=surface.r0 + [0.0, 1.0, 0.0])
+    (tmp_path / "fields").mkdir()
+    rows: list[Row] = [dict.fromkeys(COLUMNS, 0) | dict.fromkeys(TEXTS, "") | {"point": i} for i in range(3)]
+    rows = [row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i} for i, row in enumerate(rows)]
+    series = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03))
+    table = PathTable(tmp_path / "path.csv")
+    for i, row in enumerate(rows):
+        series.write(i, surface, row)
+        table.write(row)
+    table.close()
+    reader = pyvista.get_reader(tmp_path / "fields/path.pvd")
+    assert reader.time_values == [0.0, 0.2, 0.4]
+    again = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03), rows=rows[:2])
+    assert again.kept == 2
+    again.write(2, surface, {**rows[2], "p_over_pc": 0.1})
+    assert pyvista.get_reader(tmp_path / "fields/path.pvd").time_values == [0.0, 1.0, 2.0]
+    assert write_whole_shells(tmp_path) == ["whole_0000.vtu", "whole_0001.vtu", "whole_0002.vtu", "whole.pvd"]
+    whole = pyvista.read(tmp_path / "fields/whole_0001.vtu")
+    assert whole.n_cells == 2 * len(surface.cells)
+    assert whole.bounds[2:4] == pytest.approx((-2.0, 2.0))
+    assert whole.field_data["R_in_m"] == pytest.approx([0.03])

@@ -11,7 +11,7 @@ import numpy as np
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu
+from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
@@ -78,6 +78,7 @@ def plot(
     animation: bool = False,
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
+    whole: bool = False,
 ) -> list[str]:
     """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
 
@@ -86,6 +87,8 @@ def plot(
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
     drawn = draw(folder, point, options, shapes)
+    if whole:
+        drawn += [f"fields/{name}" for name in write_whole_shells(folder)]
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
