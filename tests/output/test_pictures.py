@@ -362,7 +362,7 @@ def _mirrored(T: Array, m: Array) -> Array:
 def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path) -> None:
     """The pressure where it rises, the points where it turns back; a half and its image in one file."""
     mirror, surface = np.array([0.0, 1.0, 0.0]), plate(0.1)
-    surface = replace(surface, r0=surface.r0 + [0.0, 1.0, 0.0])
+    surface = replace(surface, r0=surface.r0 + np.array([0.0, 1.0, 0.0]))
     (tmp_path / "fields").mkdir()
     rows: list[Row] = [dict.fromkeys(COLUMNS, 0) | dict.fromkeys(TEXTS, "") | {"point": i} for i in range(3)]
     rows = [row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i} for i, row in enumerate(rows)]

@@ -140,9 +140,8 @@ def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
         str(tmp_path / "both.pdf"),
     ]
     other = [{**row, "amplitude": row["amplitude"] and "force"} for row in rows[run]]
-    with pytest.raises(
-        CaseError, match="copy: its curve is force over w_over_h, that of .* p_over_pc over volume_change"
-    ):
+    said = r"copy: its curve is force over w_over_h, that of .* p_over_pc over volume_change: draw"
+    with pytest.raises(CaseError, match=said):
         runs_figure({run: rows[run], again: other}, OutputSection())
 
 
