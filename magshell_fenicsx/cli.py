@@ -16,6 +16,7 @@ from magshell_fenicsx.command import (
     Over,
     Result,
     Run,
+    Runs,
     Settings,
     chosen_folder,
     exit_codes,
@@ -23,6 +24,7 @@ from magshell_fenicsx.command import (
     folder_option,
     left_to_the_shell,
     picture_options,
+    points_of,
     print_line,
     refuse_lost,
     result_option,
@@ -300,9 +302,16 @@ def compare(
 
 @app.command()
 def plot(
-    folder: Run,
+    folders: Runs,
     point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
     animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
+    shapes: Annotated[
+        str | None, typer.Option(metavar="N,N", help="put the shell at these points on the curve")
+    ] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")] = False,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")] = Path(
+        "curves.png"
+    ),
     formats: Annotated[
         str | None, typer.Option(metavar="KIND,KIND", help="besides png: svg, pdf, with text as text")
     ] = None,
@@ -316,15 +325,22 @@ def plot(
         list[str] | None, typer.Option("--range", metavar="FIELD=LOW:HIGH", help="of colours, as w_over_h=-2:2; repeat")
     ] = None,
 ) -> None:
-    """Draw the pictures and write the report of a run again, from its folder; options as in the section output."""
+    """Draw the pictures and write the report of a run again, from its folder; of several runs their curves in one."""
+    from magshell_fenicsx.input.source import CaseError
     from magshell_fenicsx.output.pictures.plot import plot as plot_again
+    from magshell_fenicsx.output.pictures.plot import plot_runs
 
     if world().rank:
         return
     with exit_codes(stopped=(OSError,)):
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
-        drawn = plot_again(folder, point, animation, options)
-    print_line(f"{', '.join(drawn)} in {folder}/")
+        if len(folders) > 1:
+            if point is not None or animation or shapes or whole:
+                raise CaseError("plot: of several runs the curves are drawn in one picture: give one folder for more")
+            print_line(", ".join(plot_runs(folders, out, options)))
+            return
+        drawn = plot_again(folders[0], point, animation, options, points_of(shapes), whole)
+    print_line(f"{', '.join(drawn)} in {folders[0]}/")
 
 
 @app.command()

@@ -68,6 +68,26 @@ Run = Annotated[
 ]
 
 
+Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="DIR...", help="folders of finished or interrupted runs", autocompletion=left_to_the_shell),
+]
+
+
+def points_of(text: str | None) -> list[int]:
+    """The numbers of points in `--shapes`.
+
+    Raises
+    ------
+    CaseError
+        If they cannot be read.
+    """
+    try:
+        return [int(number) for number in text.split(",")] if text else []
+    except ValueError:
+        raise CaseError(f"--shapes {text}: write it as numbers of points, for example 0,12,40") from None
+
+
 def folder_option(default: str) -> Any:
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
 

@@ -22,7 +22,7 @@ from benchmarks.obstacles_table import Line, draw, draw_beams, write
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.output.pictures.curve import smooth
+from magshell_fenicsx.output.pictures.lines import smooth
 from magshell_fenicsx.output.store.checkpoint import OtherSources
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.public import run

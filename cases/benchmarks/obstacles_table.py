@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.pictures.curve import smooth
+from magshell_fenicsx.output.pictures.lines import smooth
 from magshell_fenicsx.output.store.table import write_csv
 
 Array = NDArray[np.float64]

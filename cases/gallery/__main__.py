@@ -12,6 +12,8 @@ from PIL import Image
 
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.output.store.known import case_in, headline
+from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
 WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
@@ -46,7 +48,7 @@ def row(file: Path) -> str:
     lines = [line.strip() for line in said.stdout.splitlines() if line.strip() and not line.startswith("results in")]
     last = lines[-1] if lines else said.stderr.strip()
     end = f" Ends with exit code {said.returncode}." if said.returncode else ""
-    shots = [folder / name for name in FIRST if (folder / name).exists()]
+    shots = [folder / name for name in (*telling(folder), *FIRST) if (folder / name).exists()]
     if not shots:
         raise SystemExit(f"{file.name}: no picture: {said.stderr.strip() or last}")
     _shrink(shots[0], OUT / f"{file.stem}.png")
@@ -56,9 +58,20 @@ def row(file: Path) -> str:
     )
 
 
+def telling(folder: Path) -> list[str]:
+    """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode."""
+    if not (folder / "path.csv").exists():
+        return []
+    rows = read_rows(folder / "path.csv")
+    row = headline(case_in(folder), rows)
+    if rows[-1]["amplitude"] == "time":
+        return ["curve.png"]
+    return ["instabilities.png"] if row["label"] == "bifurcation" else []
+
+
 def _shrink(source: Path, target: Path) -> None:
     picture = Image.open(source).convert("RGB")
-    wide = WIDTH * (2 if picture.width > 2 * picture.height else 1)
+    wide = WIDTH * (2 if picture.width > 1.5 * picture.height else 1)
     picture.thumbnail((wide, 10 * WIDTH))
     picture.point(lambda value: STEP * round(value / STEP)).save(target, optimize=True)
 

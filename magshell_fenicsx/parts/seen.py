@@ -107,6 +107,10 @@ class Seen:
         """Those of its columns that are moments where others of the kind are forces."""
         return ()
 
+    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+        """Of amplitudes that are motions: whether it turns, and how far it goes at one, over R or in rad."""
+        return {}
+
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Column -> value."""
         return {}

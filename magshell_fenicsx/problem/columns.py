@@ -2,6 +2,9 @@
 
 from collections.abc import Collection
 from dataclasses import replace
+from math import isnan
+
+import numpy as np
 
 from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
@@ -9,12 +12,19 @@ from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.quantity import TURN, WAY
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 
 def sizes_in_units(problem: Problem) -> Sizes:
     """The sizes of the case's units."""
-    return sizes_of(problem.context, {column for room in SEEN for column in room.moments(problem.loads)})
+    sizes = sizes_of(problem.context, {column for room in SEEN for column in room.moments(problem.loads)})
+    if sizes.given is None or isnan(sizes.given.R):
+        return sizes
+    ways = {name: way for room in SEEN for name, way in room.ways(problem.loads).items()}
+    lengths = {name: (WAY, 1e3 * sizes.given.R * way) for name, (turns, way) in ways.items() if way and not turns}
+    angles = {name: (TURN, float(np.degrees(way))) for name, (turns, way) in ways.items() if way and turns}
+    return replace(sizes, ways=lengths | angles)
 
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:

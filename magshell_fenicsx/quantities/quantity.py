@@ -116,6 +116,8 @@ FORCE = Unit("force", "N", "N", "N", _in_si, formula="")
 TORQUE = Unit("torque", "N m", "N_m", "N m", _in_si, formula="")
 WORK = Unit("work", "J", "J", "J", _in_si, formula="")
 TIME = Unit("t", "", "s", "s", lambda g: g.second, formula="")
+WAY = Unit("way", "", "mm", "mm", formula="")  # of motions, each of its own size
+TURN = Unit("turn", "", "degrees", "degrees", formula="")
 SECONDS = Unit("s", "s")
 DEGREES = Unit("degrees", "degrees")
 
@@ -262,8 +264,8 @@ class Quantity:
 
     @property
     def scale(self) -> str:
-        """The key of its unit; of a number without one the kind."""
-        return self.units[0].key if self.units else self.kind
+        """The key of its unit; of a number without one the kind, also of the factor of a motion."""
+        return self.units[0].key if self.units and self.units[0] is not WAY else self.kind
 
     def of(self, name: str) -> "Quantity":
         """The column of one of several."""

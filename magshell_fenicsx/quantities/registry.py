@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isnan, nan
 
@@ -19,7 +19,9 @@ from magshell_fenicsx.quantities.quantity import (
     STRENGTH,
     THICKNESS,
     TIME,
+    TURN,
     VOLUME,
+    WAY,
     Amplitude,
     Given,
     Kind,
@@ -219,7 +221,7 @@ def quantity(name: str) -> Quantity:
         return longest.of(name.removeprefix(f"{longest.name}_"))
     kinds: dict[str, tuple[Kind, Unit]] = {"u": ("place", PLACE), "f": ("reaction", REACTION), "m": ("moment", MOMENT)}
     ending = re.search(r"_([ufm])[xyz]$", name)
-    kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", ())
+    kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (WAY, TURN))
     return Quantity(name, name.replace("_", " "), "", kind, units=units)
 
 
@@ -258,7 +260,7 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
     for reaction in (*(f"{each}_{name}" for each in reactions), *reactions) if name not in AMPLITUDES else ():
         if reaction in row:
-            return quantity(name), shown(reaction, row)
+            return shown(name, row), shown(reaction, row)
     varied, own = amplitude(name), f"w_{name}_over_h"
     over, drawn = shown(own if own in row else varied.conjugate, row), shown(varied.column, row)
     if varied.conjugate == "w_over_h":
@@ -276,10 +278,13 @@ class Sizes:
         What the case gives with units; None for nothing.
     moments
         Columns of reactions that are moments.
+    ways
+        Columns of motions -> the unit of their way, and its size.
     """
 
     given: Given | None = None
     moments: Collection[str] = ()
+    ways: Mapping[str, tuple[Unit, float]] = field(default_factory=dict)
 
     @cached_property
     def of(self) -> Mapping[str, float]:
@@ -297,6 +302,8 @@ class Sizes:
 
     def unit(self, name: str) -> Unit | None:
         """The unit in which a column is shown; None if it has none in this case."""
+        if name in self.ways:
+            return self.ways[name][0]
         there = [unit for unit in quantity(name).units if self._size(unit) is not None]
         if name in self.moments:
             there = [unit for unit in there if unit is MOMENT]
@@ -314,4 +321,9 @@ class Sizes:
     def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
         """The values of a row in units."""
         units = ((name, unit) for name in row if (unit := self.unit(name)))
-        return {quantity(name).in_unit(unit).name: float(row[name]) * self.of[unit.key] + 0.0 for name, unit in units}
+        return {quantity(name).in_unit(unit).name: float(row[name]) * self.size(name) + 0.0 for name, unit in units}
+
+    def size(self, name: str) -> float:
+        """What one of a column is in the unit in which it is shown; one without."""
+        unit = self.unit(name)
+        return self.ways[name][1] if name in self.ways else self.of[unit.key] if unit else 1.0

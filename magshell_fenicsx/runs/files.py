@@ -14,16 +14,18 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, solids
 from magshell_fenicsx.output.fields.surface import turned
-from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, About, FieldSeries, is_whole, outlines, point_file
-from magshell_fenicsx.output.report.verdict import read_run
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
+from magshell_fenicsx.output.report.verdict import plain, read_run, verdict
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, sync_folder, write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
-from magshell_fenicsx.output.store.table import PathTable, Row
+from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
 from magshell_fenicsx.output.store.written import (
     MESH,
     NEW,
@@ -226,11 +228,11 @@ class RunFiles:
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         problem = self._scene.problem
         mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror else None
-        about = About(problem.material.h, problem.material.nu, mirror)
+        about = About(problem.material.h, problem.material.nu, mirror, given(problem.context.shell).R)
         drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
         moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)
         name = "" if not drawn else DRIVEN if moves else STILL
-        self._fields = FieldSeries(self._folder / "fields", about, name)
+        self._fields = FieldSeries(self._folder / "fields", about, name, self._table.kept)
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept
 
@@ -252,9 +254,10 @@ class RunFiles:
         def write() -> None:
             assert surface is not None
             problem = self._scene.problem
-            whole = replace(surface, outlines=outlines(problem.loads, state.mu, problem.material.h))
+            beside = problem.loads, state.mu, problem.material.h
+            whole = replace(surface, outlines=outlines(*beside), solids=solids(*beside))
             self._table.write(row)
-            self._fields.write(number, turned(whole, problem.azimuth))
+            self._fields.write(number, turned(whole, problem.azimuth), row)
 
         by_first(self._comm, write)
 
@@ -262,8 +265,9 @@ class RunFiles:
         """Write summary.json."""
 
         def write() -> None:  # names the mesh file and the sources as they were at the start
-            data = (json.dumps({**content, **self._begun_with}, indent=2) + "\n").encode()
-            write_whole(self._folder / SUMMARY, data)
+            data = json.loads(json.dumps({**content, **self._begun_with}))
+            data["says"] = plain(verdict(data, read_lines(self._folder / "path.csv")))
+            write_whole(self._folder / SUMMARY, (json.dumps(data, indent=2) + "\n").encode())
 
         by_first(self._comm, write)
 

@@ -91,7 +91,7 @@ def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     divided = vtkDataSetSurfaceFilter()
-    divided.SetInputData(unstructured_grid(surface, h))
+    divided.SetInputData(unstructured_grid(surface, h, deformed=True))
     divided.SetNonlinearSubdivisionLevel(2)
     divided.Update()
     smooth = pyvista.PolyData(divided.GetOutput())

@@ -166,6 +166,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     scene, asked = result.scene, result.adapted.asked if result.adapted else result.scene.problem
     material, model, newton = scene.problem.material, scene.model, scene.newton
     R_over_h, time_unit = 1 / material.h, scene.problem.time_unit
+    snapped, sizes = snaps(result.rows), scene.sizes
     return {
         "case": asked.document.data,
         FILE: asked.document.name,
@@ -197,7 +198,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "knockdown": result.knockdown,
         "critical_field": result.critical_field,
         "barrier": result.barrier,
-        "snaps": snaps(result.rows),
+        "snaps": snapped,
+        **({"snap_time_ms": 1e3 * snapped[0]["time"] * sizes.size("time")} if snapped and sizes.unit("time") else {}),
         "frequencies": [
             {
                 "point": number,

@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
@@ -207,7 +207,7 @@ def amount(scene: Scene, name: str, value: float) -> str:
     """The value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
     column = amplitude(name).column
     known = scene.sizes.column(column)
-    measured = known and f" ({value * scene.sizes.of[quantity(column).scale]:.6g} {known.si})"
+    measured = known and f" ({value * scene.sizes.size(column):.6g} {known.si})"
     return f"{name} = {value:.6g}{measured or ''}"
 
 

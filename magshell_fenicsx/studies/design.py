@@ -33,7 +33,7 @@ from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_en
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate
-from magshell_fenicsx.studies.design_picture import draw_design
+from magshell_fenicsx.studies.design_picture import draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
 from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
 from magshell_fenicsx.studies.points import identity
@@ -214,9 +214,14 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
         "violation": wanted.violation(best),
         "sources": code_version(),
     }
-    by_first(comm, lambda: draw_design(made.rows, wanted.results, vary, x, folder / "design.png"))
+    goal = section.objective
+    asked = {goal.reach: goal.value} if goal.reach and goal.value is not None else {}
+    drawn = partial(draw_design, made.rows, wanted.results, vary, x, folder / "design.png", asked)
+    by_first(comm, drawn)
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
+    for target in wanted.targets.values():
+        by_first(comm, lambda target=target: drawn(reached_shape(folder / "verified", target)))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")

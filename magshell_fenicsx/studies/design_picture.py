@@ -1,13 +1,15 @@
-"""design.png: the results over the evaluations, the remanence, and the fields that vary."""
+"""design.png: the results over the evaluations, the wanted shape, the remanence, and the fields that vary."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design_blocks import Between
 from magshell_fenicsx.studies.design_variables import Variables
@@ -19,57 +21,128 @@ TITLES = {
     "curvature": r"natural curvature $\kappa R$",
     "deviation": "deviation $w_0/h$",
 }
+ARROW = 0.12  # the longest vector over the shell's extent
+IN_PLANE = 1e-6  # over R
 MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 
-def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Variables, x: Array, file: Path) -> None:
-    """Write the picture."""
+@dataclass(frozen=True)
+class Reached:
+    """A wanted shape and the one that is reached: places (n, 3) along the middle of the shell."""
+
+    wanted: Array
+    reached: Array
+    undeformed: Array
+
+
+def reached_shape(folder: Path, target: Callable[[Array], Array]) -> Reached | None:
+    """What a run's last point has of a wanted shape, along the shell's nodes in the plane y = 0; None without any."""
+    numbers = sorted(int(file.stem.removeprefix("point_")) for file in (folder / "fields").glob("point_*.vtu"))
+    if not numbers:
+        return None
+    surface, _ = read_point(folder / "fields", numbers[-1])
+    off = np.abs(surface.r0[:, 1])
+    at = np.flatnonzero(off <= off.min() + IN_PLANE)
+    at = at[np.argsort(surface.r0[at, 0], kind="stable")]
+    return Reached(target(surface.r0[at]), (surface.r0 + surface.u)[at], surface.r0[at])
+
+
+def draw_design(
+    rows: Sequence[dict[str, Any]],
+    results: Sequence[str],
+    vary: Variables,
+    x: Array,
+    file: Path,
+    asked: Mapping[str, float] | None = None,
+    shape: Reached | None = None,
+) -> None:
+    """Write the picture.
+
+    Parameters
+    ----------
+    asked
+        Result -> the value that is wanted.
+    shape
+        The shapes, where one is wanted.
+    """
     from matplotlib.figure import Figure
 
     units = dict.fromkeys(map(_unit, results))
-    panels = 1 + (vary.controls is not None) + len(vary.fields)
-    figure = Figure(figsize=(4.6 * panels, max(3.8, 2.2 * len(units))), dpi=160, layout="constrained")
+    panels = 1 + (shape is not None) + (vary.controls is not None) + len(vary.fields)
+    figure = Figure(figsize=(4.0 * panels, max(3.6, 2.1 * len(units))), dpi=160, layout="constrained")
     grid = figure.add_gridspec(len(units), panels)
     above: Any = None
     for i, unit in enumerate(units):
         above = figure.add_subplot(grid[i, 0], sharex=above)
-        _draw_history(above, rows, [result for result in results if _unit(result) == unit], unit)
+        _draw_history(above, rows, [result for result in results if _unit(result) == unit], unit, asked or {})
         above.tick_params(labelbottom=i == len(units) - 1)
-    above.set_xlabel("evaluation (dots: the best so far)")
+    above.set_xlabel("evaluation (line: the best so far)")
     others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
+    if shape is not None:
+        _draw_shape(others.pop(0), shape)
     if vary.controls and vary.remanence:
-        places, vectors = vary.controls.places, vary.vectors(x)
-        names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
-        widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
-        first, second = (0, len(names) - 1) if vary.remanence.planar else sorted(int(i) for i in widest)
-        others[0].plot(places[:, first], places[:, second], ".", color="0.6", markersize=3)
-        others[0].quiver(
-            places[:, first], places[:, second], vectors[:, first], vectors[:, second], color="C3", width=0.006
-        )
-        title = r"remanence over $|B^\mathrm{r}|$, undeformed"
-        others[0].set(xlabel=f"${names[first]}/R$", ylabel=f"${names[second]}/R$", title=title)
-        others[0].set_aspect("equal", adjustable="datalim")
-        others[0].margins(0.2)
+        _draw_remanence(others[0], vary, x)
     for axes, field in zip(others[len(others) - len(vary.fields) :], vary.fields, strict=True):
         _draw_field(axes, field, field.values(x[vary.blocks[field.name]]))
     figure.savefig(file)
 
 
-def _draw_history(axes: Any, rows: Sequence[dict[str, Any]], results: Sequence[str], unit: str) -> None:
-    """Results of one unit over the evaluations."""
+def _draw_history(
+    axes: Any, rows: Sequence[dict[str, Any]], results: Sequence[str], unit: str, asked: Mapping[str, float]
+) -> None:
+    """Results of one unit over the evaluations: all that were tried as faint dots, the best so far as a line."""
     number, best = (
         np.array([row[key] for row in rows], dtype=kind) for key, kind in (("evaluation", int), ("best", bool))
     )
-    for result in results:
+    for i, result in enumerate(results):
         values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
-        (line,) = axes.plot(number, values, "-", linewidth=0.8, label=_name(result))
-        axes.plot(number[best], values[best], "o", markersize=3, color=line.get_color())
+        colour, wide = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)  # lines that lie on each other are all seen
+        axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
+        until = np.append(number[best], number[-1:] if best.any() else [])
+        reached = np.append(values[best], values[best][-1:])
+        axes.plot(until, reached, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=_name(result))
+        if result in asked:
+            axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
             axes.set_yscale("log")
     shown = unit if unit in {"Hz", *endings().values()} else ""
-    axes.set_ylabel(_name(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else shown)
+    several = shown or "results"
+    axes.set_ylabel(_name(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
+
+
+def _draw_shape(axes: Any, shape: Reached) -> None:
+    """The wanted and the reached shape from the side."""
+    axes.plot(*shape.undeformed[:, ::2].T, "--", color="0.6", linewidth=0.8, label="undeformed")
+    axes.plot(*shape.wanted[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
+    axes.plot(*shape.reached[:, ::2].T, color="C0", linewidth=1.3, label="reached")
+    axes.set(xlabel="$x/R$", ylabel="$z/R$", title="along the middle, $y = 0$")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _draw_remanence(axes: Any, vary: Variables, x: Array) -> None:
+    """The vectors at their places on the undeformed shell, with room for the longest."""
+    assert vary.controls
+    places, vectors = vary.controls.places, vary.vectors(x)
+    names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
+    widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
+    planar = vary.remanence is not None and vary.remanence.planar
+    first, second = (0, len(names) - 1) if planar else sorted(int(i) for i in widest)
+    across, up = places[:, first], places[:, second]
+    joined = "-" if vary.controls.around or not places[:, 1:].any() else ""
+    axes.plot(across, up, joined + ".", color="0.6", markersize=3, linewidth=1)
+    longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
+    size = ARROW * float(np.ptp(places, axis=0).max()) / longest
+    right, above = size * vectors[:, first], size * vectors[:, second]
+    axes.quiver(across, up, right, above, color="C3", width=0.006, angles="xy", scale_units="xy", scale=1)
+    axes.update_datalim(np.column_stack([across + right, up + above]))
+    axes.set(xlabel=f"${names[first]}/R$", ylabel=f"${names[second]}/R$")
+    axes.set_title(r"remanence over $|B^\mathrm{r}|$, undeformed")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.autoscale_view()
 
 
 def _unit(result: str) -> str:

@@ -29,6 +29,7 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.ensemble_picture import draw_ensemble
 from magshell_fenicsx.studies.folds import KnownFolds, fold_row, has_knockdown
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
@@ -44,7 +45,7 @@ from magshell_fenicsx.studies.runner import (
     part_of,
 )
 from magshell_fenicsx.studies.samples import Sample, make_samples
-from magshell_fenicsx.studies.statistics import WITHOUT, Row, draw_ensemble, make_row, report, statistics, write_samples
+from magshell_fenicsx.studies.statistics import WITHOUT, Row, make_row, report, statistics, write_samples
 
 MOST_SAMPLES = 100_000
 MOST_TRIES = 2  # points of the path from which the fold ahead is tried

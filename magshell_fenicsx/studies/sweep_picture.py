@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from magshell_fenicsx.input.section import given
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
 from magshell_fenicsx.studies.points import Axis, SweepPoint, along, short
 from magshell_fenicsx.studies.runner import Outcome
@@ -27,6 +28,8 @@ NAMES = {  # words and symbol of keys
     "amplitude": ("amplitude over $h$", ""),
 }
 MAPPED = 3  # least different values of both axes of a map
+SMOOTH = 8  # least for contours; fewer are cells with their values
+WRITTEN, LONGEST, BRIGHT = 9, 5, 0.6  # most columns and digits of written values; colours from here on are bright
 KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E h R^2$)"
 
 
@@ -74,12 +77,25 @@ def draw_sweep(
         _values(plot, axes, points, results)
     else:
         _curves(plot, points, outcomes)
+    plot.set_title(_fixed(axes, points), fontsize=9)
     labels = plot.get_legend_handles_labels()[1]
     if labels and any(labels):
         columns = -(-len(labels) // LEGEND_ROWS)
         figure.legend(loc="outside right upper", fontsize=8, frameon=False, ncols=columns)
     figure.savefig(file, dpi=200)
     plt.close(figure)
+
+
+def _fixed(axes: Sequence[Axis], points: Sequence[SweepPoint]) -> str:
+    """R/h and Poisson's ratio, where all points have the same."""
+    found = []
+    for symbol, values in (
+        ("$R/h$", {round(given(point.case.shell).R_over_h, 9) for point in points}),
+        (r"$\nu$", {point.case.shell.poisson_ratio for point in points}),
+    ):
+        if len(values) == 1:
+            found.append(f"{symbol} = {next(iter(values)):.6g}")
+    return ", ".join(found)
 
 
 def _is_map(axes: Sequence[Axis]) -> bool:
@@ -117,6 +133,8 @@ def _ends(outcomes: Sequence[Outcome]) -> Results:
 
 def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
     """Colours and contours over both swept numbers; points without a result are crosses in a hole."""
+    from matplotlib.ticker import MaxNLocator
+
     rows, columns = axes
     x, y = (sorted(set(axis.numbers or ())) for axis in (columns, rows))
     grid = np.full((len(y), len(x)), np.nan)
@@ -124,9 +142,14 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
         i, j = y.index(rows.number(point.values[rows.keys[0]])), x.index(columns.number(point.values[columns.keys[0]]))
         grid[i, j] = np.nan if value is None else value
     hole = np.isnan(grid)
-    filled = plot.contourf(x, y, grid, 20, cmap="viridis")
-    lines = plot.contour(x, y, grid, 8, colors="white", linewidths=0.8)
-    plot.clabel(lines, fontsize=8)
+    if min(grid.shape) < SMOOTH:
+        filled = plot.pcolormesh(x, y, grid, cmap="viridis", shading="nearest")
+        _write_values(plot, x, y, grid)
+    else:
+        levels = MaxNLocator(24, steps=[1, 2, 5, 10]).tick_values(np.nanmin(grid), np.nanmax(grid))
+        filled = plot.contourf(x, y, grid, levels, cmap="viridis")
+        lines = plot.contour(x, y, grid, levels[::2], colors="white", linewidths=0.8)  # at steps of the colours
+        plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
     for hidden, style in ((False, {"marker": ".", "color": "0.15"}), (True, {"marker": "x", "color": "0.5"})):
         plot.plot(*places[hole == hidden].T, linestyle="", markersize=4, clip_on=False, zorder=5, **style)
@@ -135,6 +158,23 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
         second = bar.ax.secondary_yaxis("left", functions=_scales(results.size))
         second.set_ylabel(results.measured)
     plot.set(xlabel=_axis_label(columns), ylabel=_axis_label(rows))
+    plot.locator_params(axis="x", nbins=6)  # long numbers would touch
+
+
+def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) -> None:
+    """Write the value into each cell of a coarse map, light on dark."""
+    low, high = np.nanmin(grid), np.nanmax(grid)
+    digits = max(0, 2 - int(np.floor(np.log10(max(abs(low), abs(high)) or 1.0))))
+    if len(x) > WRITTEN or digits > LONGEST:
+        return
+    for (i, j), value in np.ndenumerate(grid):
+        if np.isfinite(value):
+            light = value - low > BRIGHT * (high - low)
+            text = f"{value:.{digits}f}".replace("-", "−")
+            plot.annotate(
+                text, (x[j], y[i]), (0, 7), textcoords="offset points", ha="center", fontsize=7,
+                color="0.1" if light else "white",
+            )  # fmt: skip
 
 
 def _values(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:

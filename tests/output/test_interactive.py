@@ -69,8 +69,12 @@ def test_numbers_are_those_of_the_path(folder: Path) -> None:
     for name, column in about["columns"].items():
         assert column["values"] == [float(row[name]) for row in rows], name
     assert about["labels"] == [row["label"] for row in rows]
-    assert about["axes"] == ["volume_change", "p_over_pc"]
-    assert about["signs"] == {"volume_change": -1.0, "p_over_pc": 1.0}
+    before, pressed = about["steps"]
+    assert before["title"] == "field"
+    assert pressed["axes"] == ["volume_change", "p_over_pc"]
+    assert {name: about["columns"][name]["sign"] for name in pressed["axes"]} == {"volume_change": -1, "p_over_pc": 1}
+    assert about["columns"]["volume_change"]["label"] == "change of volume −ΔV/R³"
+    assert sorted({*before["rows"], *pressed["rows"]}) == list(range(len(rows)))
     assert about["frames"][0] == 0
     assert about["frames"][-1] == len(rows) - 1
 

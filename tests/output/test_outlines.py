@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+import pyvista
 from conftest import CASES
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, outlines, read_outlines, vtp_content
+from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, solids, vtp_content
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
 STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"
@@ -24,12 +26,25 @@ def test_outlines(tmp_path: Path) -> None:
     middle = (np.concatenate(lying).max(axis=0) + np.concatenate(lying).min(axis=0)) / 2
     np.testing.assert_allclose(middle - POSITION, [0, 0, 0.1], atol=1e-12)
     np.testing.assert_allclose(np.ptp(np.concatenate(lying), axis=0) * 30, [10, 20, 20], atol=1e-12)
+    (magnet,) = solids(driven, {"source": 0.5, "roll": 1.0}, 0.0)
+    assert magnet.name == "cylinder magnet"
+    assert magnet.poles is not None
+    assert np.ptp(magnet.points, axis=0) * 30 == pytest.approx([10, 20, 20])
+    north = magnet.points[magnet.poles > 0].mean(axis=0) - magnet.points[magnet.poles < 0].mean(axis=0)
+    assert north / np.linalg.norm(north) == pytest.approx([1, 0, 0], abs=1e-12)  # it was e3 before the quarter turn
     (tmp_path / STILL).write_bytes(vtp_content(still))
-    (tmp_path / DRIVEN.format(3)).write_bytes(vtp_content(lying))
+    (tmp_path / DRIVEN.format(3)).write_bytes(vtp_content(lying, [magnet]))
     for number, lines in ((2, still), (3, lying)):
-        for found, line in zip(read_outlines(tmp_path, number), lines, strict=True):
+        for found, line in zip(read_outlines(tmp_path, number)[0], lines, strict=True):
             np.testing.assert_allclose(found, line, atol=1e-6)
-    assert read_outlines(tmp_path / "none", 0) == ()
+    _, (same,) = read_outlines(tmp_path, 3)
+    assert same.name == magnet.name
+    assert same.points == pytest.approx(magnet.points, abs=1e-6)
+    assert (same.triangles == magnet.triangles).all()
+    shown = pyvista.read(tmp_path / DRIVEN.format(3))
+    assert (shown.n_lines, shown.n_faces_strict) == (len(lying), len(magnet.triangles))
+    assert list(shown.field_data["names"]) == [magnet.name]
+    assert read_outlines(tmp_path / "none", 0) == ((), ())
 
 
 def test_bodies_are_where_their_approach_has_brought_them() -> None:
@@ -45,4 +60,10 @@ def test_bodies_are_where_their_approach_has_brought_them() -> None:
         case = Case.load(CASES / "ball_contact.yaml", [f"bodies={{ball: {{{kind}}}}}"])
         lines = np.concatenate(outlines(make_problem(case).loads, {"approach": 3.0}, h))
         np.testing.assert_allclose(lines[:, 2].min(), 1 + h / 2 - 3 * h, atol=1e-12)
+        (solid,) = solids(make_problem(case).loads, {"approach": 3.0}, h)
+        assert solid.name == "ball"
+        assert solid.poles is None
+        assert [solid.points.min(axis=0), solid.points.max(axis=0)] == pytest.approx(
+            np.array([lines.min(axis=0), lines.max(axis=0)]), abs=2e-3
+        )
         np.testing.assert_allclose(np.ptp(lines, axis=0)[:2].min(), wide, rtol=3e-3)

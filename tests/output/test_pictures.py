@@ -11,21 +11,33 @@ import basix
 import matplotlib.image
 import numpy as np
 import pytest
+import pyvista
 from dolfinx.cpp.io import perm_vtk
 from dolfinx.mesh import CellType
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface, completed
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.colours import loads, strains
+from magshell_fenicsx.output.pictures.colours import loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
-from magshell_fenicsx.output.pictures.layout import SIGNED, colour_map, png, written
+from magshell_fenicsx.output.pictures.layout import png, written
 from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, figures, spread
-from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen, tessellated, towards
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_map
+from magshell_fenicsx.output.pictures.view import (
+    LAMP,
+    RELIEF,
+    RIM,
+    Camera,
+    Seen,
+    Window,
+    axes_on_screen,
+    tessellated,
+    towards,
+)
 from magshell_fenicsx.output.store.known import pole_of
-from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, PathTable, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
@@ -68,15 +80,24 @@ def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
     assert colours(128)[:3] == (1.0, 1.0, 1.0)
 
 
-def test_shade_has_no_hue() -> None:
-    """A plate seen at 60 degrees is grey where its value is zero: light does not change ratios of colours."""
-    camera = Camera(np.array([0.0, -np.sin(np.pi / 3), np.cos(np.pi / 3)]))
-    image = Seen.of(plate(0.0), camera, Window.around(camera(SQUARE), 300)).coloured(
-        np.zeros(4), (-1.0, 1.0), colour_map(SIGNED)
-    )
-    red, green, blue, opaque = image[image.shape[0] // 2, 150]
-    assert red == green == blue == round(255 * (1 - 0.45 * 0.25))
-    assert opaque == 255
+def slopes(rise: float) -> Surface:
+    """Two rectangles beside each other, the left one rising, the right one falling: a roof, or a valley."""
+    left = np.array([[-1.0, -1, 0], [0, -1, rise], [0, 1, rise], [-1, 1, 0]])
+    right = left * [-1.0, 1, 1]
+    r = np.concatenate([left, right])
+    cells = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    return Surface(r, 0 * r, np.tile([0.0, 0, 1], (8, 1)), cells, {})
+
+
+def test_light_comes_from_the_upper_left() -> None:
+    """A roof is light on its left, a valley on its right, so that a dent is no bump; by hand, and without a hue."""
+    shown = {rise: seen(slopes(rise)).coloured(np.zeros(8), (-1.0, 1.0), colour_map(SIGNED)) for rise in (0.5, -0.5)}
+    normal, lamp = np.array([0.5, 0, 1]) / np.hypot(0.5, 1), np.array(LAMP) / np.linalg.norm(LAMP)  # of the right one
+    away = lamp[2] - normal @ lamp
+    dark = 255 * (1 - RELIEF * away / (1 + away / 2) - RIM * (1 - normal[2]) ** 2)
+    for image, right in ((shown[0.5], 225), (shown[-0.5], 75)):
+        assert image[150, right, :3] == pytest.approx(np.full(3, dark), abs=1.5)
+        assert (image[150, 300 - right, :3] == 255).all()
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
@@ -155,7 +176,7 @@ def test_sizes_and_formats() -> None:
     assert matplotlib.image.imread(io.BytesIO(files["shell.png"])).shape[1] == pytest.approx(60 / 25.4 * 150, abs=2)
     svg = ElementTree.fromstring(files["shell.svg"])
     texts = ["".join(each.itertext()).strip() for each in svg.iter("{http://www.w3.org/2000/svg}text")]
-    assert "−10" in texts
+    assert {"0", "10"} <= set(texts)  # the ends of the bar
     letters = {"".join(sorted(re.sub(r"\s", "", text))) for text in texts}  # mathematics has its own order
     assert "".join(sorted("inwardnormaldisplacementw/h")) in letters
     assert len(list(svg.iter("{http://www.w3.org/2000/svg}image"))) >= 1
@@ -165,9 +186,9 @@ def test_sizes_and_formats() -> None:
 
 
 def test_ranges_of_colours() -> None:
-    """Those asked for; the bar's ends are pointed where values lie beyond them."""
+    """Those of the values and zero, or those asked for."""
     bars = [drawn(plate(0.1), "shell", ranges=ranges)["shell"].axes[1] for ranges in ({}, {"w_over_h": [0.0, 2.0]})]
-    assert [tuple(bar.get_xlim()) for bar in bars] == [(-10.0, 10.0), (0.0, 2.0)]
+    assert [tuple(bar.get_xlim()) for bar in bars] == [(0.0, 10.0), (0.0, 2.0)]
 
 
 def test_opposite_fields_are_opposite_arrows() -> None:
@@ -198,24 +219,39 @@ def test_magnetic_loads_tell_what_is_zero() -> None:
         "Not defined for this remanence or field: in-plane force."
     )
     surface.fields["k"] = np.array([0.0, -0.5, 0.2, 0])
-    assert loads(surface, 0.01)[0][1].limits == (-0.5, 0.5)
+    assert loads(surface, 0.01)[0][1].limits == (-0.5, 0.2)
 
 
-def limits(E_1: Array, E_2: Array) -> tuple[float, float]:
+def limits(E_1: Array, E_2: Array) -> list[tuple[float, float]]:
     surface = plate(0.0)
     surface.fields.update({"E_1": E_1, "E_2": E_2})
-    first, second = strains(surface)
-    assert first.limits == second.limits
-    return first.limits
+    return [layer.limits for layer in strains(surface, 0.01)[0]]
 
 
 def test_rounding_is_no_pattern() -> None:
-    """Strains that are zero are white, and those of one value one colour; colours are white at zero."""
+    """Strains that are zero are white, those of one value one colour, one that is zero beside the other is left out."""
     noise = np.array([1.0, -1, 0.5, 0])
-    assert limits(1e-15 * noise, 1e-15 * noise) == (-1, 1)
-    low, high = limits(0.02 + 1e-12 * noise, 1e-15 * noise)
+    assert limits(1e-15 * noise, 1e-15 * noise) == [(-1, 1), (-1, 1)]
+    ((low, high),) = limits(0.02 + 1e-12 * noise, 1e-15 * noise)
     assert high == pytest.approx(0.02)
-    assert low == -high
+    assert low == 0
+    assert colour_map(SIGNED, (low, high))(0)[:3] == (1.0, 1.0, 1.0)
+
+
+def test_strains_of_the_mesh_are_no_picture() -> None:
+    """In pure bending: those of 1e-6 that differ by 14 % between cells are named; resolved or larger ones are drawn."""
+    wave = np.array([1.0, 0.5, 0.2, 0.1])
+    surface = plate(0.0)
+    surface.fields.update({"E_1": 1e-6 * wave, "E_2": -1e-6 * wave, "M_1": wave, "M_2": 0 * wave})
+    assert len(strains(replace(surface, strain_jump=0.01), 0.01)[0]) == 2
+    noisy = replace(surface, strain_jump=0.14)
+    assert strains(noisy, 0.01) == ([], "")
+    shown, said = moments(noisy, 0.01)
+    assert [layer.name for layer in shown] == ["M_1"]
+    assert "The smaller principal moment is zero everywhere." in said
+    assert "those of bending are 5000 times larger" in said
+    surface.fields["E_1"] = 1e-3 * wave
+    assert len(strains(replace(surface, strain_jump=0.14), 0.01)[0]) == 1
 
 
 def test_arrows_are_apart() -> None:
@@ -309,6 +345,11 @@ def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert same.fields.keys() == surface.fields.keys()
     for name, values in surface.fields.items():
         assert (same.fields[name] == values).all()
+    grid = pyvista.read(tmp_path / point_file(0))
+    assert np.asarray(grid.points) == pytest.approx(surface.r0)
+    warped = grid.warp_by_vector("u")
+    assert np.asarray(warped.points) == pytest.approx(surface.r0 + surface.u)
+    assert {"u: R", "u_over_h: h", "E: 1", "k: h E lambda_m"} <= set(grid.field_data["units"])
     whole = completed(same, mirror)
     assert whole.fields["E"][4:] == pytest.approx(_mirrored(surface.fields["E"], mirror))
 
@@ -316,3 +357,29 @@ def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
 def _mirrored(T: Array, m: Array) -> Array:
     Q = np.eye(3) - 2 * np.outer(m, m)
     return np.einsum("ai,nij,bj->nab", Q, T, Q)
+
+
+def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path) -> None:
+    """The pressure where it rises, the points where it turns back; a half and its image in one file."""
+    mirror, surface = np.array([0.0, 1.0, 0.0]), plate(0.1)
+    surface = replace(surface, r0=surface.r0 + np.array([0.0, 1.0, 0.0]))
+    (tmp_path / "fields").mkdir()
+    rows: list[Row] = [dict.fromkeys(COLUMNS, 0) | dict.fromkeys(TEXTS, "") | {"point": i} for i in range(3)]
+    rows = [row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i} for i, row in enumerate(rows)]
+    series = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03))
+    table = PathTable(tmp_path / "path.csv")
+    for i, row in enumerate(rows):
+        series.write(i, surface, row)
+        table.write(row)
+    table.close()
+    reader = pyvista.get_reader(tmp_path / "fields/path.pvd")
+    assert reader.time_values == [0.0, 0.2, 0.4]
+    again = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03), rows=rows[:2])
+    assert again.kept == 2
+    again.write(2, surface, {**rows[2], "p_over_pc": 0.1})
+    assert pyvista.get_reader(tmp_path / "fields/path.pvd").time_values == [0.0, 1.0, 2.0]
+    assert write_whole_shells(tmp_path) == ["whole_0000.vtu", "whole_0001.vtu", "whole_0002.vtu", "whole.pvd"]
+    whole = pyvista.read(tmp_path / "fields/whole_0001.vtu")
+    assert whole.n_cells == 2 * len(surface.cells)
+    assert whole.bounds[2:4] == pytest.approx((-2.0, 2.0))
+    assert whole.field_data["R_in_m"] == pytest.approx([0.03])

@@ -10,9 +10,13 @@ from PIL import Image
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
+from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.picture import PICTURES
-from magshell_fenicsx.output.pictures.plot import draw, draw_animation, in_true_time, plot
+from magshell_fenicsx.output.pictures.plot import Drawn, draw, draw_animation, in_true_time, plot, plot_runs
+from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
 from magshell_fenicsx.output.store.table import read_rows
+from magshell_fenicsx.problem.wanted import OutputSection
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +122,44 @@ def test_animation(run: Path, tmp_path: Path) -> None:
     foot = changes[:, -20:]
     assert (foot == 0).all()
     assert (changes[-1] > 40).any()
+
+
+def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
+    """The labels say in what the cases differ; marks and lines of each; curves over other quantities are refused."""
+    again = copied(run, tmp_path)
+    summary = again / "summary.json"
+    summary.write_text(summary.read_text().replace('"lambda_m": 0.0001', '"lambda_m": 0.0002'))
+    rows = {folder: read_rows(folder / "path.csv") for folder in (run, again)}
+    (axes,) = runs_figure(rows, OutputSection()).axes
+    assert [line.get_label() for line in axes.lines if "lambda" in str(line.get_label())] == [
+        r"$\lambda_\mathrm{m}$ = 0.0001",
+        r"$\lambda_\mathrm{m}$ = 0.0002",
+    ]
+    assert plot_runs([run, again], tmp_path / "both.png", {"formats": ["pdf"]}) == [
+        str(tmp_path / "both.png"),
+        str(tmp_path / "both.pdf"),
+    ]
+    other = [{**row, "amplitude": row["amplitude"] and "force"} for row in rows[run]]
+    said = r"copy: its curve is force over w_over_h, that of .* p_over_pc over volume_change: draw"
+    with pytest.raises(CaseError, match=said):
+        runs_figure({run: rows[run], again: other}, OutputSection())
+
+
+def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
+    """Each beside its point, within the axes, and not on each other."""
+    again = copied(run, tmp_path, "*.png")
+    last = len(read_rows(again / "path.csv")) - 1
+    drawn = Drawn(again)
+    figure = curve_figure(drawn.rows, "pressure", drawn.style)
+    parts = worth_drawing(drawn_parts(drawn.rows, "pressure"))
+    shown = [(drawn.rows[i], drawn.at(drawn.rows[i])[0]) for i in (2, last)]
+    add_shapes(figure, parts, shown, drawn.style, drawn.camera)
+    figure.draw_without_rendering()
+    boxes = [each.offsetbox.get_window_extent() for each in figure.axes[0].artists]
+    assert len(boxes) == 2
+    assert not boxes[0].overlaps(boxes[1])
+    frame = figure.axes[0].get_window_extent()
+    assert all(frame.contains(*corner) for box in boxes for corner in box.corners())
+    assert "curve.png" in draw(again, shapes=[2, last])
+    with pytest.raises(CaseError, match=f"--shapes 999: .* has points 0 to {last}"):
+        draw(again, shapes=[999])

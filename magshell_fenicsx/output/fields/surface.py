@@ -19,6 +19,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
+from magshell_fenicsx.shape.solids import Solid
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
@@ -47,12 +48,14 @@ class Surface:
         larger first; those of `point_fields.PointFields`; w0_over_h where there are imperfections, of a solid that
         alone.
     outlines
-        Places (n, 3) along lines: the sources of the applied field.
+        Places (n, 3) along lines: the sources of the applied field, and bodies.
     jump
         By how much the cells' own bending moments differ from the smooth field M, over their size (see `jump`).
         None of a solid.
     strain_jump
         The same of the strains E.
+    solids
+        The faces of those.
     """
 
     r0: Array
@@ -63,6 +66,7 @@ class Surface:
     outlines: tuple[Array, ...] = ()
     jump: float | None = None
     strain_jump: float | None = None
+    solids: tuple[Solid, ...] = ()
 
     @property
     def is_body(self) -> bool:
@@ -240,6 +244,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         surface.outlines,
         surface.jump,
         surface.strain_jump,
+        surface.solids,
     )
 
 
@@ -267,5 +272,6 @@ def _moved(surface: Surface, Q: Array) -> Surface:
 
     fields = {name: moved(f) for name, f in surface.fields.items()}
     lines = tuple(line @ Q for line in surface.outlines)
+    solids = tuple(solid.moved(Q.T, np.zeros(3)) for solid in surface.solids)
     r0, u, n0 = (moved(f) for f in (surface.r0, surface.u, surface.n0))
-    return replace(surface, r0=r0, u=u, n0=n0, fields=fields, outlines=lines)
+    return replace(surface, r0=r0, u=u, n0=n0, fields=fields, outlines=lines, solids=solids)

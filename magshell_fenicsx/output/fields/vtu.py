@@ -1,7 +1,10 @@
 """Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read them back."""
 
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,24 +12,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.fields.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
+from magshell_fenicsx.output.fields.outlines import read_outlines, vtp_content
+from magshell_fenicsx.output.fields.surface import (
+    LAGRANGE_HEXAHEDRON,
+    LAGRANGE_TRIANGLE,
+    TRIANGLE,
+    Surface,
+    completed,
+)
 from magshell_fenicsx.output.store.durable import Damaged, write_whole
+from magshell_fenicsx.output.store.table import read_rows
+from magshell_fenicsx.quantities.registry import amplitude, shown
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
-import re
-from collections.abc import Mapping
-from dataclasses import replace
-
-from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.output.fields.surface import completed
-from magshell_fenicsx.parts.magnetism.driven import carried
 
 Array = NDArray[np.float64]
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
 FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
-OWN_DATA = ("u_over_h", "w_over_h", "r0", "n0")
+OWN_DATA = ("u", "u_over_h", "w_over_h", "r0", "n0")
+UNITS = {  # of the arrays, for those who open them elsewhere
+    **dict.fromkeys(("points", "u", "r0"), "R"),
+    **dict.fromkeys(("u_over_h", "w_over_h", "w0_over_h", "gap_over_h"), "h"),
+    **dict.fromkeys(("n0", "E", "E_1", "E_2", "E_total"), "1"),
+    **dict.fromkeys(("M", "M_1", "M_2"), "D/R"),
+    **dict.fromkeys(("p_mag", "f_mag"), "E lambda_m"),
+    **dict.fromkeys(("k", "tau"), "h E lambda_m"),
+    "Br": "largest remanence",
+    "Ba": "mu0 E / largest remanence",
+    "contact_pressure": "E h/R",
+}
+LATER = 1e-9  # between points of one time, in units of the time
 
 
 @dataclass(frozen=True)
@@ -41,15 +58,20 @@ class About:
         Poisson's ratio.
     mirror
         Unit normal (3,) of the mirror plane of a half shell, then its offset if that is not zero; None for a whole one.
+    R
+        In metres; nan of a case without units.
     """
 
     h: float
     nu: float
     mirror: Array | None = None
+    R: float = nan
 
 
-def unstructured_grid(surface: Surface, h: float) -> "vtkUnstructuredGrid":
-    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R.
+def unstructured_grid(surface: Surface, h: float, *, deformed: bool = False) -> "vtkUnstructuredGrid":
+    """The surface or body with u, u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R.
+
+    Its points are undeformed, so that warping by the vector `u` deforms it to scale, or deformed.
 
     It is built without pyvista, which takes longer to import than all fields of a path to write.
     """
@@ -58,13 +80,13 @@ def unstructured_grid(surface: Surface, h: float) -> "vtkUnstructuredGrid":
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 
     points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
-    points.SetData(numpy_to_vtk(surface.r0 + surface.u, deep=True))
+    points.SetData(numpy_to_vtk(surface.r0 + surface.u if deformed else surface.r0, deep=True))
     number, count = surface.cells.shape
     starts, nodes = np.arange(0, (number + 1) * count, count), surface.cells.ravel()
     cells.SetData(*(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, nodes)))
     grid.SetPoints(points)
     grid.SetCells(TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE, cells)
-    own = (surface.u / h, surface.w / h, surface.r0, surface.n0)
+    own = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
     fields = {name: f if f.ndim < 3 else f[:, *SYMMETRIC] for name, f in surface.fields.items()}
     for name, values in {**dict(zip(OWN_DATA, own, strict=True)), **fields}.items():
         _give(grid.GetPointData(), name, values)
@@ -124,14 +146,16 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     def arrays(of: Any) -> dict[str, Array]:
-        return {of.GetArrayName(i): vtk_to_numpy(of.GetArray(i)) for i in range(of.GetNumberOfArrays())}
+        there = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
+        return {name: vtk_to_numpy(array) for name, array in there if array}  # texts are no numbers
 
     cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(grid.GetNumberOfCells(), -1)
     data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
     fields = {name: f[:, FULL] if f.shape[1:] == (6,) else f for name, f in data.items() if name not in OWN_DATA}
     if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
-    about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
+    R = float(numbers["R_in_m"][0]) if "R_in_m" in numbers else nan
+    about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"), R)
     r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
     if (
         {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
@@ -152,6 +176,8 @@ class FieldSeries:
     ----------
     outlines
         Name of a point's file with the outlines of sources and bodies, of its number; empty without.
+    rows
+        Those of the points that an interrupted run has written.
 
     Attributes
     ----------
@@ -159,18 +185,19 @@ class FieldSeries:
         Number of leading points whose files are whole.
     """
 
-    def __init__(self, folder: Path, about: About, outlines: str = "") -> None:
+    def __init__(self, folder: Path, about: About, outlines: str = "", rows: Sequence[Mapping[str, Any]] = ()) -> None:
         self._folder, self._about, self._outlines = folder, about, outlines
         folder.mkdir(exist_ok=True)
         self.kept = 0
         while all(map(is_whole, self._files(self.kept))):
             self.kept += 1
-        self._numbers = list(range(self.kept))
+        self.kept = min(self.kept, len(rows)) if rows else self.kept
+        self._rows: list[Mapping[str, Any]] = list(rows[: self.kept]) or [{"point": n} for n in range(self.kept)]
         if self.kept:
             self._write_list()
 
-    def write(self, number: int, surface: Surface) -> None:
-        """Write a point's file.
+    def write(self, number: int, surface: Surface, row: Mapping[str, Any] | None = None) -> None:
+        """Write a point's file; `row` is that of path.csv.
 
         Raises
         ------
@@ -178,9 +205,9 @@ class FieldSeries:
             If the disk is full; the file is not written then.
         """
         if self._outlines:
-            write_whole(self._folder / self._outlines.format(number), vtp_content(surface.outlines))
+            write_whole(self._folder / self._outlines.format(number), vtp_content(surface.outlines, surface.solids))
         write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
-        self._numbers.append(number)
+        self._rows.append(row or {"point": number})
         self._write_list()
 
     def _files(self, number: int) -> list[Path]:
@@ -189,14 +216,51 @@ class FieldSeries:
         return [self._folder / name for name in names]
 
     def _write_list(self) -> None:
-        files = [(n, 0, point_file(n)) for n in self._numbers]
-        files += [(n, 1, self._outlines.format(n)) for n in self._numbers if self._outlines]
-        rows = "\n".join(f'    <DataSet timestep="{n}" part="{part}" file="{file}"/>' for n, part, file in files)
-        content = (
-            '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-            f"{rows}\n  </Collection>\n</VTKFile>\n"
-        )
-        write_whole(self._folder / "path.pvd", content.encode())
+        numbers = [int(row["point"]) for row in self._rows]
+        names = [(n, [point_file(n), *([self._outlines.format(n)] if self._outlines else [])]) for n in numbers]
+        write_whole(self._folder / "path.pvd", pvd_content(abscissae(self._rows), [files for _, files in names]))
+
+
+def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
+    """The content of a .pvd file: the files of each point, part 0 the shell, at its place on ParaView's time axis."""
+    rows = "\n".join(
+        f'    <DataSet timestep="{t!r}" part="{part}" file="{file}"/>'
+        for t, each in zip(at, files, strict=True)
+        for part, file in enumerate(each)
+    )
+    return (
+        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
+        f"{rows}\n  </Collection>\n</VTKFile>\n"
+    ).encode()
+
+
+def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Where the points of a path are on ParaView's time axis: they rise.
+
+    The time of a run with motions, in s if it has units; points at rest follow it closely. Else the amplitude that
+    varied, in the case's unit, if it is one and rises all the way; else the numbers of the points.
+
+    Examples
+    --------
+    >>> abscissae([{"point": i, "time": t, "amplitude": "time"} for i, t in enumerate([0.0, 0.0, 0.5])])
+    [0.0, 1e-09, 0.5]
+    >>> pressed = [{"point": i, "p_over_pc": p, "amplitude": "pressure"} for i, p in enumerate([0, 0.2, 0.3])]
+    >>> abscissae(pressed), abscissae([*pressed, {**pressed[0], "point": 3}])
+    ([0.0, 0.2, 0.3], [0.0, 1.0, 2.0, 3.0])
+    """
+    numbers = [float(row["point"]) for row in rows]
+    varied = {str(row.get("amplitude", "")) for row in rows} - {""}
+    if rows and "time" in rows[0]:
+        found = list[float]()
+        for row in rows:
+            t = float(row[shown("time", row).name])
+            found.append(max(t, found[-1] + LATER) if found else t)
+        return found
+    if len(varied) != 1:
+        return numbers
+    column = shown(amplitude(next(iter(varied))).column, rows[0]).name
+    loads = [float(row[column]) for row in rows]
+    return loads if all(a < b for a, b in pairwise(loads)) else numbers
 
 
 def point_file(number: int) -> str:
@@ -209,15 +273,24 @@ def vtu_content(surface: Surface, about: About) -> bytes:
 
     LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more on curved surfaces.
     """
+    from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     grid = unstructured_grid(surface, about.h)
     numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
     numbers |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
+    numbers |= {"R_in_m": None if isnan(about.R) else np.array([about.R])}
     for name, values in numbers.items():
         if values is not None:
             _give(grid.GetFieldData(), name, values)
+    units = vtkStringArray()
+    units.SetName("units")
+    data = grid.GetPointData()
+    names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
+    for name in (name for name in names if name in UNITS):
+        units.InsertNextValue(f"{name}: {UNITS[name]}")
+    grid.GetFieldData().AddArray(units)
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
@@ -229,63 +302,28 @@ def vtu_content(surface: Surface, about: About) -> bytes:
     return content if isinstance(content, bytes) else content.encode()
 
 
-ARRAY = re.compile(r'Name="(\w+)" [^>]*>([^<]*)</DataArray>')  # in the files of `vtp_content`
-STILL, DRIVEN = "outlines.vtp", "outlines_{:04d}.vtp"  # of all points, or of each
-
-
-def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
-    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven sources and bodies."""
-    bodies = [
-        line + mu.get(c.amplitude, 0.0) * h * c.direction
-        for c in loads.contacts
-        for line in getattr(c.distance, "lines", ())
-    ]
-    field = loads.magnetic
-    if field is None:
-        return tuple(bodies)
-    found = [line for part in getattr(field.in_space, "parts", ()) for line in getattr(part, "lines", ())]
-    for each in field.driven:
-        Q, t = carried(each.motions, mu)
-        found += [line @ Q.T + t for line in getattr(each.of, "lines", ())]
-    return (*bodies, *found)
-
-
-def vtp_content(lines: tuple[Array, ...]) -> bytes:
-    """The content of a .vtp file; VTK's own writer takes as long as a step of a path."""
-    places = np.concatenate(lines)
-    arrays = {
-        "Points": ("Float64", places),
-        "connectivity": ("Int64", np.arange(len(places))),
-        "offsets": ("Int64", np.cumsum([len(line) for line in lines])),
-    }
-    data = {
-        name: f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{a[0].size}" format="ascii">'
-        f"{' '.join(map(repr, a.ravel().tolist()))}</DataArray>"
-        for name, (kind, a) in arrays.items()
-    }
-    return (
-        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1" byte_order="LittleEndian"><PolyData>\n'
-        f'<Piece NumberOfPoints="{len(places)}" NumberOfLines="{len(lines)}">\n<Points>{data.pop("Points")}</Points>\n'
-        f"<Lines>{''.join(data.values())}</Lines>\n</Piece></PolyData></VTKFile>\n"
-    ).encode()
-
-
-def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:
-    """Those beside the fields of a point; none without any."""
-    file = folder / DRIVEN.format(number)
-    file = file if file.exists() else folder / STILL
-    if not file.exists():
-        return ()
-    try:
-        parts = {name: text.split() for name, text in ARRAY.findall(file.read_text(encoding="utf-8"))}
-        ends = np.array(parts["offsets"], dtype=int)
-        return tuple(np.split(np.array(parts["Points"], dtype=float).reshape(-1, 3), ends[:-1]))
-    except (KeyError, ValueError) as e:
-        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
-
-
 def read_point(folder: Path, number: int) -> tuple[Surface, About]:
     """The surface of a point in a folder of fields, with the outlines beside it; a half shell is completed."""
     surface, about = read_vtu(folder / point_file(number))
-    surface = replace(surface, outlines=read_outlines(folder, number))
+    lines, solids = read_outlines(folder, number)
+    surface = replace(surface, outlines=lines, solids=solids)
     return surface if about.mirror is None else completed(surface, about.mirror), about
+
+
+def write_whole_shells(folder: Path) -> list[str]:
+    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the names of the files.
+
+    Raises
+    ------
+    Damaged
+        If a point cannot be read.
+    """
+    fields, rows, names = folder / "fields", read_rows(folder / "path.csv"), list[str]()
+    rows = [row for row in rows if (fields / point_file(int(row["point"]))).exists()]
+    for row in rows:
+        number = int(row["point"])
+        surface, about = read_point(fields, number)
+        names.append(f"whole_{number:04d}.vtu")
+        write_whole(fields / names[-1], vtu_content(surface, replace(about, mirror=None)))
+    write_whole(fields / "whole.pvd", pvd_content(abscissae(rows), [[name] for name in names]))
+    return [*names, "whole.pvd"]

@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.beside import near_places
 from magshell_fenicsx.output.pictures.colours import Coloured
-from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
-from magshell_fenicsx.output.pictures.layout import SIGNED, Boxes, Panel, colour_bar, directions, drawing
+from magshell_fenicsx.output.pictures.curve import plot_curve
+from magshell_fenicsx.output.pictures.layout import Boxes, Panel, directions, drawing
+from magshell_fenicsx.output.pictures.lines import Part, drawn_parts, place
 from magshell_fenicsx.output.pictures.picture import Background
-from magshell_fenicsx.output.pictures.view import Camera, Image, Window, near_outlines
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window
 from magshell_fenicsx.output.store.table import POLE, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 
@@ -29,7 +32,10 @@ HELD = 1500  # milliseconds of the last frame
 MOST_CURVES = 4  # beside each other
 COLOURS = 128
 STYLE = OutputSection(dpi=120, font_size=9)
+WHITE = (255, 255, 255)
 FOOT = 34  # pixels below the shell
+GREY, RIM = 0.35, 0.8  # of the line around what is drawn, and how much of it is seen
+Array = NDArray[np.float64]
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
@@ -75,8 +81,9 @@ def animated(
     with drawing(STYLE):
         views = _views(surfaces, h, factor, camera)
         frames = _composed(views, factor, titles, rows, shown, pole)
+    dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
     palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
-    first, *others = (Pillow.fromarray(f).quantize(palette=palette, dither=Pillow.Dither.NONE) for f in frames)
+    first, *others = (Pillow.fromarray(frame).quantize(palette=palette, dither=dither) for frame in frames)
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
     content = io.BytesIO()
@@ -91,19 +98,20 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    palette.putpalette([c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []])
+    found = [c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []]
+    palette.putpalette([*WHITE, *found[3:]])
     return palette
 
 
 def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
     """The same window and colours for all frames."""
-    limit = max(float(np.abs(s.w).max()) / h for s in surfaces) or 1.0
+    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
     moved = [replace(s, u=factor * s.u) for s in surfaces]
-    places = [r for s in moved for r in (s.r0 + s.u, *near_outlines(s))]
+    places = [r for s in moved for r in (s.r0 + s.u, *near_places(s))]
     window = Window.around(camera(np.concatenate([surfaces[0].r0, *places])), WINDOW)
     panels = []
     for surface, drawn in zip(surfaces, moved, strict=True):
-        layer = Coloured("w_over_h", np.asarray(surface.w / h), (-limit, limit), SIGNED, "$w/h$")
+        layer = Coloured("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
         panels.append(Background(drawn, camera, WINDOW, window).panel(layer, STYLE))
     return panels
 
@@ -162,7 +170,17 @@ def _composed(
 def _lay(image: Image, under: NDArray[np.uint8]) -> None:
     """Put an image with transparency on a part of a frame."""
     part = image[..., 3:] / 255
-    under[:] = np.rint(part * image[..., :3] + (1 - part) * under)
+    laid = part * image[..., :3] + (1 - part) * under
+    edge = RIM * _edge(part)
+    under[:] = np.rint((1 - edge) * laid + edge * 255 * GREY)
+
+
+def _edge(part: Array) -> Array:
+    """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at its rim."""
+    least = part.copy()
+    for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        least = np.minimum(least, np.roll(part, way, axis))
+    return np.asarray(part - least)
 
 
 def _scale(factor: float) -> str:

@@ -1,12 +1,13 @@
 """Fields as colours: values, limits, captions with units; what is zero or cannot be said is named, not drawn."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.layout import SIGNED
+from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, from_zero
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
@@ -41,6 +42,8 @@ ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from
 ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
 LEAST_JUMP = 0.01  # per cent
 NOISE = 20.0  # colour limit over the difference between fields of cells and the smooth ones
+NONE = 0.01  # of the larger of two fields: what is smaller is zero
+UNRESOLVED, SLIGHT = 0.05, 0.02  # differences between cells, and strains over those of bending, that are not drawn
 DETAIL, AROUND = 0.15, 2.0  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 
@@ -59,16 +62,41 @@ class Coloured:
 def shell(surface: Surface, h: float) -> list[Coloured]:
     """w/h, white at zero."""
     w = np.asarray(surface.w / h, np.float64)
-    limit = float(np.abs(w).max()) or 1.0
-    return [Coloured("w_over_h", w, (-limit, limit), SIGNED, "inward normal displacement $w/h$")]
+    limits = from_zero(float(w.min()), float(w.max()))
+    return [Coloured("w_over_h", w, limits, SIGNED, "inward normal displacement $w/h$")]
 
 
-def strains(surface: Surface) -> list[Coloured]:
-    return _principal(surface, STRAINS, surface.strain_jump)
+def strains(surface: Surface, h: float) -> tuple[list[Coloured], str]:
+    """The principal strains, and a sentence on them; none where they are those of the mesh."""
+    if bent_alone(surface, h):
+        return [], ""
+    shown, said = _principal(surface, STRAINS, surface.strain_jump)
+    return shown, " ".join([*said, jump_said(surface.strain_jump, "strains")]) if shown else ""
 
 
-def moments(surface: Surface) -> list[Coloured]:
-    return _principal(surface, MOMENTS, surface.jump)
+def moments(surface: Surface, h: float) -> tuple[list[Coloured], str]:
+    """The principal moments, and a sentence on them, and on strains that are not drawn."""
+    shown, said = _principal(surface, MOMENTS, surface.jump)
+    if shown:
+        said.append(jump_said(surface.jump, "moments"))
+    return shown, " ".join([*said, bent_alone(surface, h)]) if shown else ""
+
+
+def bent_alone(surface: Surface, h: float) -> str:
+    """That strains are not drawn, where they are small beside those of bending and differ from cell to cell."""
+    if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or (surface.strain_jump or 0.0) < UNRESOLVED:
+        return ""
+    largest, bending = (
+        max(float(np.abs(surface.fields[name]).max()) for name in names) for names in (STRAINS, MOMENTS)
+    )
+    bending *= h / 2
+    if not 0 < largest < SLIGHT * bending:
+        return ""
+    times = f"{float(f'{bending / largest:.1g}'):.0f}" if largest > 1e-4 * bending else "more than 10 000"
+    return (
+        f"Strains of the mid-surface are not drawn: those of bending are {times} times larger, "
+        f"and the former differ from cell to cell by {100 * (surface.strain_jump or 0.0):.2g} % (rms)."
+    )
 
 
 def jump_said(jump: float | None, what: str) -> str:
@@ -80,13 +108,32 @@ def jump_said(jump: float | None, what: str) -> str:
     return f"Smoothed across cells, whose own {what} differ from what is drawn {far} (rms)."
 
 
-def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -> list[Coloured]:
-    """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible."""
+def _largest(surface: Surface, names: Iterable[str]) -> float:
+    return max(float(np.abs(surface.fields[name]).max()) for name in names)
+
+
+def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -> tuple[list[Coloured], list[str]]:
+    """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible.
+
+    One that is zero beside the other is named, not drawn.
+    """
     if not captions.keys() <= surface.fields.keys():
-        return []
+        return [], []
     first, second = captions
     limit = max(_limit(surface, first, second), _noise(surface, first, second, jump or 0.0))
-    return [Coloured(name, surface.fields[name], (-limit, limit), SIGNED, said) for name, said in captions.items()]
+    shown, said = list[Coloured](), list[str]()
+    sizes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
+    for name, caption in captions.items():
+        values = surface.fields[name]
+        if sizes[name] < NONE * max(sizes.values()):
+            said.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
+            continue
+        below, above = from_zero(float(values.min()), float(values.max()), NONE)
+        limits = (-limit if below < 0 else 0.0, limit if above > 0 else 0.0)
+        if max(sizes.values()) < ROUNDING[first]:
+            limits = -limit, limit
+        shown.append(Coloured(name, values, limits, SIGNED, caption))
+    return shown, said
 
 
 def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
@@ -138,7 +185,7 @@ def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
         if largest < ZERO:
             zero.append(words)
             continue
-        limits = (-largest, largest) if signed else (0.0, largest)
+        limits = from_zero(float(values.min()), float(values.max())) if signed else (0.0, largest)
         shown.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, caption))
     said = [f"Zero everywhere: {', '.join(zero)}."] if zero else []
     said += [f"Not defined for this remanence or field: {', '.join(unknown)}."] if unknown else []
@@ -152,7 +199,7 @@ def contact(surface: Surface) -> list[Coloured]:
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
     most = float(pressure.max()) or 1.0
     return [
-        Coloured("gap_over_h", gap, (0.0, 1.0), "viridis_r", "gap$/h$"),
+        Coloured("gap_over_h", gap, (0.0, 1.0), NEAR, "gap$/h$"),
         Coloured("contact_pressure", pressure, (0.0, most), "Reds", r"contact pressure $pR/(Eh)$"),
     ]
 

@@ -1,51 +1,53 @@
-"""The load-displacement or pressure-volume curve as a picture."""
+"""The load-displacement or pressure-volume curve as a picture, and natural frequencies along a path."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import groupby, zip_longest
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from magshell_fenicsx.output.fields.modes import Frequency
 from magshell_fenicsx.output.pictures.captions import write_numbers
-from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing, number_format
-from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name
+from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
+from magshell_fenicsx.output.pictures.lines import (
+    FINE,
+    Part,
+    axes_for,
+    drawn_parts,
+    is_unstable,
+    lines_of,
+    named,
+    place,
+)
+from magshell_fenicsx.output.pictures.scales import number_format
+from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.wanted import OutputSection
-from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown
 from magshell_fenicsx.quantities.registry import amplitude as registered
+from magshell_fenicsx.quantities.registry import shown
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-from collections import defaultdict
 
-from magshell_fenicsx.output.fields.modes import Frequency
-
-if TYPE_CHECKING:  # takes long to import
-    from matplotlib.figure import Figure
-
-FINE = 16  # drawn segments between two points
+Array = NDArray[np.float64]
 DASHED = (0, (2, 1.2))
 NARROW = 0.3  # of the figure: few numbers fit below
-
-
-def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
-    """A smooth curve (2, FINE (n - 1) + 1) through n points without overshoot; the parameter is the scaled chord."""
-    xy = np.array([x, y])
-    scale = np.ptp(xy, axis=1)
-    steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
-    chord = np.concatenate([[0], np.cumsum(np.maximum(steps, 1e-12))])
-    fine = np.interp(np.arange(FINE * (len(chord) - 1) + 1) / FINE, np.arange(len(chord)), chord)
-    return np.asarray(scipy.interpolate.PchipInterpolator(chord, xy, axis=1)(fine))
+MARKS = {"fold": "o", "bifurcation": "D"}
+MARK = 3.5  # points
+HIDDEN = 12.0  # points: an unstable part as small as this is hidden by the marks at its ends
+AROUND = 0.8  # around such a part in its inset, over its size
+STRAIGHT = 0.005  # of its extent: a curve as near as this to its chord is a straight line
+INSET = 0.4  # of the axes
+CROWDED = 0.02  # of the points of all curves: an inset that covers more has no place
 
 
 def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, place: str = POLE) -> "Figure":
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked and numbered.
 
-    Of a programme each step is drawn. Stable parts are solid, unstable parts dashed. A user-defined amplitude is drawn
-    over the displacement of the pole, or what is called so.
+    Of a programme each step is drawn, the last one largest, but for steps of a single straight line. Stable parts are
+    solid, unstable parts dashed; an unstable part that its marks would hide is drawn again in an inset. A user-defined
+    amplitude is drawn over the displacement of the pole, or what is called so.
 
     Parameters
     ----------
@@ -54,134 +56,137 @@ def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, plac
     """
     from matplotlib.figure import Figure
 
-    parts = drawn_parts(rows, amplitude)
-    wide = min(len(parts), 2)
-    high = -(-len(parts) // wide)
+    parts = worth_drawing(drawn_parts(rows, amplitude))
+    first, wide = len(parts) - 1, parts[-1].amplitude == "time" or len(parts) > 2
+    across = min(first, 3) if wide and first else len(parts)
+    high = -(-first // across) if wide and first else 0
     width = (style.width or (ONE if len(parts) == 1 else SEVERAL)) / INCH
+    last, each = width * (0.45 if wide and first else 0.75 / across), 0.75 * width / max(across, 2)
     with drawing(style):
-        figure = Figure(figsize=(width, 0.75 * width / wide * high), dpi=style.dpi, layout="constrained")
-        for axes, part in zip_longest(figure.subplots(high, wide, squeeze=False).flat, parts):
-            if part is None:
-                axes.set_axis_off()
-                continue
+        figure = Figure(figsize=(width, last + high * each), dpi=style.dpi, layout="constrained")
+        grid = figure.add_gridspec(high + 1, across, height_ratios=[each] * high + [last])
+        for i, part in enumerate(parts):
+            alone = wide and i == first
+            axes = figure.add_subplot(grid[high, :] if alone else grid[i // across, i % across])
             plot_curve(axes, part, place)
             axes.set_title(part.title)
-        named = {
-            name: line for axes in figure.axes for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
-        if named:  # above the axes, where it covers no curve
-            number = min(len(named), 4 * wide)
-            figure.legend(
-                named.values(),
-                named.keys(),
-                loc="outside upper center",
-                ncols=number,
-                frameon=False,
-                handlelength=1.5,
-                columnspacing=1,
-            )
+        legend(figure, 4 * min(len(parts), 2))
+        figure.draw_without_rendering()  # insets need the places of the axes
+        for axes, part in zip(list(figure.axes), parts, strict=True):
+            draw_hidden(axes, part)
     return figure
 
 
-@dataclass(frozen=True)
-class Part:
-    """The rows in which an amplitude varied, with the one before them, and the numbers of its instabilities."""
-
-    amplitude: str
-    rows: Sequence[Row]
-    title: str = ""
-    numbers: Mapping[int, int] = field(default_factory=dict)
+def worth_drawing(parts: Sequence[Part]) -> list[Part]:
+    """The steps without those of a single straight line; the last one always."""
+    return [*(part for part in parts[:-1] if _bends(part)), parts[-1]]
 
 
-def numbered(rows: Sequence[Row]) -> dict[int, int]:
-    """Point -> number of its instability, from 1 along path.csv; so they are numbered in all pictures and tables."""
-    return {int(row["point"]): n for n, row in enumerate((row for row in rows if row["label"] in LOCATED), 1)}
+def _bends(part: Part) -> bool:
+    """Whether the points of a curve are on no line."""
+    x, y = np.array([place(row, part.amplitude) for row in part.rows]).T
+    wide, high = (float(np.ptp(values)) or 1.0 for values in (x, y))
+    (a, b), x, y = np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high], (x - x[0]) / wide, (y - y[0]) / high
+    return bool(len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0))
 
 
-def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
-    """The steps of a programme, or the last part in which the amplitude varied."""
-    steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
-    if len(steps) < 2:
-        return [Part(amplitude, varied(rows, amplitude), "", numbered(rows))]
-    parts = []
-    for step in steps:
-        first = next(i for i, row in enumerate(rows) if row["step"] == step)
-        before = max((i for i in range(first) if rows[i]["branch"] == 0), default=0)
-        within = [row for row in rows[first:] if row["step"] == step]
-        name = str(within[0]["amplitude"])
-        varying = quantity(registered(name).column).words
-        parts.append(Part(name, [rows[before], *within], f"step {step}: {varying}", numbered(rows)))
-    return parts
-
-
-def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
-    """The last part of a path in which an amplitude varied."""
-    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
-    return rows[0 if amplitude == "lambda_m" else first :]
-
-
-def place(row: Row, amplitude: str) -> tuple[float, float]:
-    """The coordinates of a point in the curve's axes."""
-    x, y = axes_of(amplitude, row)
-    return x.on_axis(row), y.on_axis(row)
-
-
-def _unstable(row: Row) -> bool:
-    """Whether the model, or a mode that it excludes, is unstable; an earlier path.csv has no excluded_pivots."""
-    return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
+def legend(figure: "Figure", most: int) -> None:
+    """One legend above all axes, where it covers no curve."""
+    entries = {name: line for axes in figure.axes for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if entries:
+        figure.legend(
+            entries.values(),
+            entries.keys(),
+            loc="outside upper center",
+            ncols=min(len(entries), most),
+            frameon=False,
+            handlelength=1.5,
+            columnspacing=1,
+        )
 
 
 def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
     """Draw a part of a path in given axes."""
-    part, amplitude = of.rows, of.amplitude
-    x, y = axes_of(amplitude, part[0])
-    if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
-        x = shown("w_pole_over_h", part[0])  # moments have no conjugate displacement
-    name = pole_name(part[0], pole).replace("$", r"\$")  # plain text, no mathematics
-    x_label, y_label = (each.label.replace(POLE, name) for each in (x, y))
-    path, drawn = [row for row in part if row["label"] != SOLUTION], list[NDArray[np.float64]]()
-    for branch in sorted({int(row["branch"]) for row in path}):
-        line = _line([row for row in path if row["branch"] == branch], amplitude)
-        smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
-        drawn.append(np.array([smooth_x, smooth_y]))
-        unstable = [_unstable(row) and row["label"] not in LOCATED for row in line]
-        for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
-            i, *others = pieces
-            piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)
-            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", lw=1.2, linestyle=DASHED if dashed else "-")
-        dots = [place(row, amplitude) for row in line if row["label"] in ("target", "step", "field")]
-        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=3)
-    marked = [row for row in part if row["label"] in LOCATED]
-    for row in marked:
-        at, kind = place(row, amplitude), str(row["label"])
-        inside = "white" if kind == "bifurcation" else "C3"
-        axes.plot(*at, "o", color="C3", markersize=4.5, label=_once(axes, kind), zorder=4, markerfacecolor=inside)
-    solutions = [row for row in part if row["label"] == SOLUTION]
+    x_label, y_label = (named(each, of.rows[0], pole, r"\$").label for each in axes_for(of))  # a name is plain text
+    drawn = draw_lines(axes, of)
+    marked = [row for row in of.rows if row["label"] in LOCATED]
+    solutions = [row for row in of.rows if row["label"] == SOLUTION]
     for row in solutions:
-        name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
+        name, inside = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
-        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
+        axes.plot(*place(row, of.amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
     texts = [str(of.numbers[int(row["point"])]) for row in marked] + [str(row["branch"]) for row in solutions]
-    places = [place(row, amplitude) for row in (*marked, *solutions)]
+    places = [place(row, of.amplitude) for row in (*marked, *solutions)]
     write_numbers(axes, list(zip(places, texts, strict=True)), drawn)
     axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(number_format())
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    if any(_unstable(row) for row in path) and marked:
+    if marked and any(is_unstable(row) for row in of.rows if row["label"] != SOLUTION):
         axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
 
-def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
-    """The rows of a branch along its curve: those of the model, and what the model excludes at its end."""
-    own = [row for row in rows if row["mode"] in OWN_MODES]
-    last, before = (place(row, amplitude) for row in (own[-1], own[max(len(own) - 2, 0)]))
-    beyond = [row for row in rows[-1:] if row not in own and row["label"] in LOCATED]
-    ahead = np.subtract(last, before)
-    return own + [row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0]
+def draw_lines(axes: "Axes", of: Part, colour: str = "C0") -> list[Array]:
+    """Draw the lines, points and marks of a part; its smooth curves (2, n)."""
+    drawn = list[Array]()
+    for line in lines_of(of):
+        curve = line.joined(*zip(*(place(row, of.amplitude) for row in line.rows), strict=True))
+        drawn.append(curve)
+        for first, last, unstable in line.pieces:
+            piece = curve[:, first * FINE : last * FINE + 1]
+            axes.plot(*piece, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
+        dots = [place(row, of.amplitude) for row in line.rows if row["label"] in ("target", "step", "field")]
+        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color=colour, markersize=3.5)
+    for row in (row for row in of.rows if row["label"] in LOCATED):
+        kind = str(row["label"])
+        axes.plot(
+            *place(row, of.amplitude),
+            MARKS[kind],
+            color="C3",
+            markerfacecolor="white",
+            markersize=MARK,
+            markeredgewidth=0.9,
+            label=_once(axes, kind),
+            zorder=4,
+        )
+    return drawn
+
+
+def hidden(axes: "Axes", of: Part) -> Array | None:
+    """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can be seen."""
+    for line in lines_of(of):
+        curve = line.joined(*zip(*(place(row, of.amplitude) for row in line.rows), strict=True))
+        for first, last, unstable in line.pieces:
+            piece = curve[:, first * FINE : last * FINE + 1]
+            size = np.ptp(axes.transData.transform(piece.T), axis=0) * 72 / axes.figure.dpi
+            if unstable and line.rows[last]["label"] in LOCATED and max(size) < HIDDEN:
+                low, high = piece.min(axis=1), piece.max(axis=1)
+                return np.array([low - AROUND * (high - low), high + AROUND * (high - low)])
+    return None
+
+
+def draw_hidden(axes: "Axes", of: Part) -> None:
+    """Draw an unstable part that its marks hide once more in an inset, in the corner with the least of the curves."""
+    if (box := hidden(axes, of)) is None:
+        return
+    points = np.concatenate([line.get_xydata() for line in axes.lines if len(line.get_xydata())])
+    inside = axes.transAxes.inverted().transform(axes.transData.transform(points))
+    gap = 0.14  # room for the numbers of the inset
+    corners = [(x, y) for y in (gap, 0.97 - INSET) for x in (0.97 - INSET, gap)]
+    low = np.array(corners) - gap
+    covered = [((inside > at) & (inside < at + INSET + gap)).all(axis=1).mean() for at in low]
+    best = int(np.argmin(covered))
+    if covered[best] > CROWDED:
+        return
+    small = axes.inset_axes((*corners[best], INSET, INSET))
+    draw_lines(small, of)
+    small.set(xlim=box[:, 0], ylim=box[:, 1])
+    small.tick_params(labelsize="x-small", length=2)
+    small.locator_params(nbins=3)
+    axes.indicate_inset_zoom(small, edgecolor="0.4", linewidth=0.6)
 
 
 def _once(axes: "Axes", name: str) -> str:

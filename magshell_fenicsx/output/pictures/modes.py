@@ -16,18 +16,15 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_vtu
 from magshell_fenicsx.output.pictures.captions import named_value
 from magshell_fenicsx.output.pictures.colours import Coloured
-from magshell_fenicsx.output.pictures.curve import numbered
 from magshell_fenicsx.output.pictures.layout import (
     GAP,
     INCH,
     LINE,
     ONE,
     SEVERAL,
-    SIGNED,
     Arrow,
     Boxes,
     Panel,
-    colour_bar,
     columns,
     directions,
     draw_panel,
@@ -35,11 +32,13 @@ from magshell_fenicsx.output.pictures.layout import (
     panel_width,
     panels_figure,
 )
+from magshell_fenicsx.output.pictures.lines import numbered
 from magshell_fenicsx.output.pictures.picture import Background, spread
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
 from magshell_fenicsx.output.pictures.view import Camera, Window
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
 from magshell_fenicsx.problem.wanted import OutputSection
-from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,6 +47,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
 SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
+ZERO = 1e-4  # of the largest load on the path: a load as small as this is zero, up to the error of where a path ends
+AGAIN = 5e-3  # of the largest displacements: an instability as near as this to an earlier one is that
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -89,7 +90,7 @@ def small_panels(
         figure.text(*boxes.place(left + wide / 2, low + tall + lines * line / 2), caption, ha="center", va="center")
     reach = min(width - gap - 8 * line, 4.0)
     box = boxes.axes((width - reach) / 2, 1.7 * line, reach, 0.65 * line)
-    colour_bar(figure, box, panel.scale)
+    colour_bar(figure, box, panel.scale, room=reach)
     directions(boxes.axes(gap / 2, 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
     return figure
 
@@ -109,8 +110,7 @@ def solutions_figure(
     surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
 ) -> "Figure":
     """Draw the deformed shells of some rows with the same colours."""
-    largest = max(float(np.abs(surface.w).max()) for surface in surfaces) / h or 1.0
-    limits = (-largest, largest)
+    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
     layers = [
         Coloured("w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$") for s in surfaces
     ]
@@ -123,8 +123,8 @@ def _name(row: Row) -> str:
     return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
 
 
-SHOWN = 0.08  # drawn size of a mode's largest displacement, over R
-CAPTION = "$w$ of the mode over its largest"
+SHOWN = 0.05  # drawn size of a mode's largest displacement, over R
+CAPTION = "$w$ of the mode over its largest, of any sign"
 
 
 def modes_figure(
@@ -165,7 +165,9 @@ def mode_figures(
     """`instabilities` of the null vectors, and `modes_NNNN` of the modes in stability.csv."""
     numbers = numbered(rows)
     singular = [row for row in rows if row["label"] in LOCATED]
-    if panels := [panel for row in singular if (panel := _null_vector(folder, row, numbers))]:
+    met = _met_again(singular)
+    first = [row for row in singular if int(row["point"]) in met]
+    if panels := [panel for row in first if (panel := _null_vector(folder, row, rows, numbers, met))]:
         yield "instabilities", _figure(panels, style, camera)
     table = folder / "stability.csv"
     if not table.exists():
@@ -184,8 +186,29 @@ def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera:
     return modes_figure(surfaces, captions, style, camera)
 
 
-def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surface, str] | None:
-    """The surface with a null vector, and its caption: number, kind, where on the path."""
+def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
+    """Point of an instability -> the rows of the same one where the path comes back to it, itself the first."""
+    found: dict[int, list[Row]] = {}
+    moved = [name for name in (singular[0] if singular else ()) if quantity(name).kind in ("displacement", "place")]
+    sizes = {name: max(abs(float(row[name])) for row in singular) for name in moved}
+
+    def alike(one: Row, other: Row) -> bool:
+        near = all(abs(float(one[name]) - float(other[name])) <= AGAIN * sizes[name] for name in moved)
+        return near and all(one[name] == other[name] for name in ("label", "mode", "amplitude"))
+
+    for row in singular:
+        same = next((each for each in found.values() if alike(each[0], row)), None)
+        if same is None:
+            found[int(row["point"])] = [row]
+        else:
+            same.append(row)
+    return found
+
+
+def _null_vector(
+    folder: Path, row: Row, rows: Sequence[Row], numbers: dict[int, int], met: Mapping[int, Sequence[Row]]
+) -> tuple[Surface, str] | None:
+    """The surface with a null vector, and its caption: numbers, kind, where on the path."""
     label = "" if row["mode"] in OWN_MODES else str(row["mode"])
     file = mode_file(folder, int(row["point"]), str(row["label"]), label)
     if not file.exists():
@@ -196,9 +219,15 @@ def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surfa
         details.append(f"m = {m}")
     details = [detail.replace("m = ", "$m$ = ") for detail in details]
     kind = f" ({', '.join(details)})" if details else ""
-    column = amplitude(str(row["amplitude"])).column
-    where = f"\n{named_value(column, row, 5)}" if row["amplitude"] else ""
-    return surface, f"{numbers[int(row['point'])]}: {row['label']}{kind}{where}"
+    where = ""
+    if row["amplitude"]:
+        column = amplitude(str(row["amplitude"])).column
+        largest = max(abs(float(each[column])) for each in rows)
+        there = row if abs(float(row[column])) > ZERO * largest else {**row, column: 0.0}
+        there = there if there is row else {**there, shown(column, row).name: 0.0}
+        where = f"\n{named_value(column, there, 5)}"
+    which = ", ".join(str(numbers[int(each["point"])]) for each in met[int(row["point"])])
+    return surface, f"{which}: {row['label']}{kind}{where}"
 
 
 def gradients_figure(by_result: Mapping[str, Surface], style: OutputSection, camera: Camera) -> "Figure":

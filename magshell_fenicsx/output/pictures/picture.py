@@ -8,28 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.beside import Beside, bare_outlines, far_said, near_places
 from magshell_fenicsx.output.pictures.colours import (
     Coloured,
     contact,
     contact_region,
-    jump_said,
     loads,
     moments,
     shell,
     strains,
 )
-from magshell_fenicsx.output.pictures.layout import (
-    Arrow,
-    Panel,
-    Pen,
-    Scale,
-    colour_map,
-    columns,
-    drawing,
-    panel_width,
-    panels_figure,
-)
-from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, near_outlines, tessellated
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel, Pen, columns, drawing, panel_width, panels_figure
+from magshell_fenicsx.output.pictures.scales import Scale, colour_map
+from magshell_fenicsx.output.pictures.view import Camera, Image, Seen, Window, tessellated
 from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -38,6 +29,9 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 GREY = 0.93  # of a surface without colours
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
+SEEN_APART = (
+    2.0  # pixels between the outlines of the undeformed and of the deformed shell; nearer the former is no news
+)
 
 
 @dataclass(frozen=True)
@@ -54,12 +48,6 @@ def _with_arrows(surface: Surface, h: float) -> Content:
     return Content([Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if found else [], far_said(surface))
 
 
-def far_said(surface: Surface) -> str:
-    """Whether there are sources of the field, or bodies, that are not drawn."""
-    left_out = len(surface.outlines) - len(near_outlines(surface))
-    return "Sources of the field, or bodies, are outside the picture." if left_out else ""
-
-
 def _of_contact(surface: Surface) -> Content:
     layers = contact(surface)
     detail = contact_region(surface) if layers else None
@@ -69,8 +57,8 @@ def _of_contact(surface: Surface) -> Content:
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {
     "shell": lambda surface, h: Content(shell(surface, h), far_said(surface)),
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
-    "strains": lambda surface, h: Content(strains(surface), jump_said(surface.strain_jump, "strains")),
-    "moments": lambda surface, h: Content(moments(surface), jump_said(surface.jump, "moments")),
+    "strains": lambda surface, h: Content(*strains(surface, h)),
+    "moments": lambda surface, h: Content(*moments(surface, h)),
     "fields": _with_arrows,
     "contact": lambda surface, h: _of_contact(surface),
 }
@@ -102,23 +90,25 @@ class Background:
 
     def __init__(self, surface: Surface, camera: Camera, width: int, window: Window | None = None) -> None:
         self._surface, self._camera = surface, camera
-        near = near_outlines(surface)
         pieces, r = tessellated(surface), surface.r0 + surface.u
-        self.window = window or Window.around(camera(np.concatenate([surface.r0, r, *near])), width)
+        self.window = window or Window.around(camera(np.concatenate([surface.r0, r, *near_places(surface)])), width)
         self.seen = Seen(pieces, r, camera, self.window)
+        self._beside = Beside(surface, camera, self.window, self.seen)
         coarse = replace(self.window, scale=self.window.scale / 2)  # enough for a line that is wider than a pixel
-        undeformed = silhouette(Seen(pieces, surface.r0, camera, coarse))
+        drawn = silhouette(self.seen)
+        undeformed = apart(silhouette(Seen(pieces, surface.r0, camera, coarse)), drawn, SEEN_APART / self.window.scale)
         self._lines = (
             *((line, UNDEFORMED) for line in undeformed),
-            *((line, EDGE) for line in silhouette(self.seen)),
-            *self._visible(near),
+            *((line, EDGE) for line in drawn),
+            *((line, OTHERS) for line in self._beside.lines),
+            *self._visible(bare_outlines(surface)),
         )
 
     def _visible(self, lines: Sequence[Array]) -> tuple[tuple[Array, Pen], ...]:
         """Lines (n, 3) in the projection, without the parts that the shell hides."""
         found = []
         for line in lines:
-            at = np.linspace(0, len(line) - 1, 8 * len(line))
+            at = np.arange(8 * (len(line) - 1) + 1) / 8  # all corners among them
             fine = np.column_stack([np.interp(at, np.arange(len(line)), x) for x in line.T])
             places = self._camera(fine)[:, :2]
             places[~self.seen.shows(fine, 2 / self.window.scale)] = np.nan
@@ -127,19 +117,46 @@ class Background:
 
     def panel(self, layer: Coloured, style: OutputSection) -> Panel:
         """The shell in a layer's colours; grey with arrows if it has none."""
+        texts = tuple(self._beside.poles)
         if not layer.colours:
             arrows = self._arrows()
-            return Panel(self.seen.plain(GREY), self.window, self._camera, lines=self._lines, arrows=arrows)
+            image = self._whole(self.seen.plain(GREY))
+            return Panel(image, self.window, self._camera, lines=self._lines, arrows=arrows, texts=texts)
         low, high = style.ranges.get(layer.name, layer.limits)
-        image = self.seen.coloured(layer.values, (low, high), colour_map(layer.colours))
+        image = self.seen.coloured(layer.values, (low, high), colour_map(layer.colours, (low, high)))
         slack = 1e-6 * (high - low)
         beyond = bool(np.nanmin(layer.values) < low - slack), bool(np.nanmax(layer.values) > high + slack)
         scale = Scale((low, high), layer.colours, layer.caption, beyond)
-        return Panel(image, self.window, self._camera, scale, self._lines)
+        return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts)
+
+    def plain(self, grey: float) -> Image:
+        """The shell in one grey, with what is beside it."""
+        return self._whole(self.seen.plain(grey))
+
+    def _whole(self, image: Image) -> Image:
+        """An image of the shell with what is beside it."""
+        for laid in self._beside.laid:
+            image = laid.on(image)
+        return image
 
     def _arrows(self) -> tuple[Arrow, ...]:
         extent = float(np.ptp(self._surface.r0 + self._surface.u, axis=0).max())
         return drawn_arrows(self._surface, self._camera, lambda r: self.seen.shows(r, 0.03 * extent))
+
+
+def apart(lines: Sequence[Array], others: Sequence[Array], distance: float) -> list[Array]:
+    """Lines (n, 2) with nan where they are as near as that to others."""
+    from scipy.spatial import cKDTree
+
+    if not len(others):
+        return list(lines)
+    near = cKDTree(np.concatenate(others))
+    found = []
+    for line in lines:
+        far = near.query(line)[0] > distance
+        if far.any():
+            found.append(np.where(far[:, None], line, np.nan))
+    return found
 
 
 def silhouette(seen: Seen) -> list[Array]:
@@ -154,6 +171,7 @@ def silhouette(seen: Seen) -> list[Array]:
 
 SEEDS, APART = 70, 0.13  # largest number of places; their least distance over the shell's extent
 LENGTH, BESIDE = 0.1, 0.014  # of the longest arrow, and from an arrow to its place, over the shell's extent
+ALIKE = 0.2  # sine of the angle below which one arrow covers another from the same place
 FIELDS = {
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$, as the shell carries it"),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
@@ -163,9 +181,9 @@ FIELDS = {
 def drawn_arrows(
     surface: Surface, camera: Camera | None = None, visible: Callable[[Array], NDArray[np.bool_]] | None = None
 ) -> tuple[Arrow, ...]:
-    """The arrows of the fields that a surface has; their feet are left and right of the place that they belong to.
+    """The arrows of the fields that a surface has; they begin at the place that they belong to.
 
-    All begin at their feet: opposite fields are opposite arrows.
+    Where one would cover the other their feet are left and right of it: opposite fields are opposite arrows.
     """
     lengths = {
         name: np.nan_to_num(np.linalg.norm(surface.fields[name], axis=1)) for name in FIELDS.keys() & surface.fields
@@ -179,18 +197,21 @@ def drawn_arrows(
     seeds = seen[spread(r[seen], APART * extent)]
     places, found = camera(r[seeds]), []
     drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in there}
-    across = _across(next(iter(drawn.values()), places)) * BESIDE * extent * (len(there) > 1)
+    across = _across(list(drawn.values()) or [places]) * BESIDE * extent
     for name, side in zip(there, (1, -1), strict=False):
         shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
         found.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
     return tuple(found)
 
 
-def _across(vectors: Array) -> Array:
-    """Unit vectors (n, 3) in the picture, to the left of projected vectors."""
-    flat = np.column_stack([-vectors[:, 1], vectors[:, 0], np.zeros(len(vectors))])
-    size = np.linalg.norm(flat, axis=1)[:, None]
-    return np.where(size > 1e-6, flat / np.maximum(size, 1e-300), np.array([-1.0, 0, 0]))
+def _across(fields: Sequence[Array]) -> Array:
+    """Unit vectors (n, 3) in the picture, left of the first projected vectors where the last cover them, or zero."""
+    (x, y), (a, b) = fields[0][:, :2].T, fields[-1][:, :2].T
+    size, other = np.hypot(x, y), np.hypot(a, b)
+    cover = np.abs(x * b - y * a) <= ALIKE * size * other
+    flat = np.column_stack([-y, x, 0 * x]) / np.maximum(size, 1e-300)[:, None]
+    left = np.where(size[:, None] > 1e-6, flat, np.array([-1.0, 0, 0]))
+    return np.asarray(left * (cover & (len(fields) > 1))[:, None])
 
 
 def spread(r: Array, apart: float) -> NDArray[np.int64]:

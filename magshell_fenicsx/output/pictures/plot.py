@@ -1,6 +1,7 @@
 """The pictures of a run, drawn from the files of its folder: path.csv and fields/*.vtu."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,15 @@ import numpy as np
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu
+from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts, frequencies_figure
+from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
 from magshell_fenicsx.output.pictures.layout import drawing, written
+from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.view import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
@@ -70,7 +73,12 @@ class Drawn:
 
 
 def plot(
-    folder: Path, point: int | None = None, animation: bool = False, options: Mapping[str, Any] | None = None
+    folder: Path,
+    point: int | None = None,
+    animation: bool = False,
+    options: Mapping[str, Any] | None = None,
+    shapes: Sequence[int] = (),
+    whole: bool = False,
 ) -> list[str]:
     """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
 
@@ -78,7 +86,9 @@ def plot(
     """
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
-    drawn = draw(folder, point, options)
+    drawn = draw(folder, point, options, shapes)
+    if whole:
+        drawn += [f"fields/{name}" for name in write_whole_shells(folder)]
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
@@ -88,7 +98,28 @@ def plot(
     return drawn
 
 
-def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | None = None) -> list[str]:
+def plot_runs(folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None) -> list[str]:
+    """Draw the curves of several runs in one picture; the names of its files.
+
+    Raises
+    ------
+    CaseError
+        If a folder has no run, or the curves do not belong together.
+    OSError
+        If a file cannot be written.
+    """
+    runs = {folder: _rows(folder) for folder in folders}
+    style = style_of(case_in(folders[0]), options)
+    names = []
+    for name, content in written(runs_figure(runs, style), style, file.stem):
+        write_whole(file.parent / name, content)
+        names.append(str(file.parent / name))
+    return names
+
+
+def draw(
+    folder: Path, point: int | None = None, options: Mapping[str, Any] | None = None, shapes: Sequence[int] = ()
+) -> list[str]:
     """Draw every picture of a finished or interrupted run.
 
     Parameters
@@ -97,6 +128,8 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
         Draw only this point: shell_0007.png, strains_0007.png, ...
     options
         Keys of the section `output` in place of those of the case.
+    shapes
+        Points whose shells are put on the curve.
 
     Returns
     -------
@@ -112,8 +145,11 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
     run = Drawn(folder, options)
     if point is not None and not 0 <= point < len(run.rows):
         raise CaseError(f"--point {point}: {folder} has points 0 to {len(run.rows) - 1}")
+    for number in shapes:
+        if not 0 <= number < len(run.rows):
+            raise CaseError(f"--shapes {number}: {folder} has points 0 to {len(run.rows) - 1}")
     names = []
-    for name, content in _of_point(run, point) if point is not None else _of_run(run):
+    for name, content in _of_point(run, point) if point is not None else _of_run(run, shapes):
         write_whole(folder / name, content)
         names.append(name)
     return names
@@ -121,16 +157,24 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
 
 def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
     surface, about = run.at(run.rows[point])
-    for name, figure in figures(surface, about.h, run.style, run.camera).items():
+    for name, figure in figures(
+        in_its_field(surface, run.rows[point], run.rows), about.h, run.style, run.camera
+    ).items():
         yield from written(figure, run.style, f"{name}_{point:04d}")
 
 
-def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
+def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
     style, last = run.style, run.on_path[-1]
     surface, about = run.at(run.headline)
     if amplitude := str(last["amplitude"]):
-        yield from written(curve_figure(run.rows, amplitude, style, run.place), style, "curve")
-    for name, figure in figures(surface, about.h, style, run.camera).items():
+        curve = curve_figure(run.rows, amplitude, style, run.place)
+        if shapes:
+            with drawing(style):
+                shells = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
+                parts = worth_drawing(drawn_parts(run.rows, amplitude))
+                add_shapes(curve, parts, shells, style, run.camera)
+        yield from written(curve, style, "curve")
+    for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
         yield from written(figure, style, name)
@@ -144,6 +188,14 @@ def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
     if found := searched(run.rows)[:MOST_PANELS]:
         surfaces = [run.at(each)[0] for each in found]
         yield from written(solutions_figure(surfaces, found, about.h, style, run.camera), style, "solutions")
+
+
+def in_its_field(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
+    """A surface without the direction of a field that is zero, and without the remanence where no row has a field."""
+    if row["lambda_m"]:
+        return surface
+    none = {"Ba"} if any(each["lambda_m"] for each in rows) else {"Ba", "Br"}
+    return replace(surface, fields={name: values for name, values in surface.fields.items() if name not in none})
 
 
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:

@@ -73,11 +73,21 @@ void rasterise(const double *places, const int32_t *triangles, int64_t count, in
     }
 }
 
-/* Colours of values at the points, times the light, on pixels of finer x finer of the above; each has four bytes.
-   facing: cosines between normals and the direction to the eye. table: colours, of low first and high last. */
+/* The light at a place: ambient, and what its normal has of the way to the lamp. The side that is seen is lit, so the
+   normal's sign does not matter. eye, lamp: cosines between normal and the ways there; one: those of a face towards the
+   eye, which has the colours themselves. */
+static float light_of(float eye, float lamp, float one, float relief, float rim)
+{
+    const float facing = eye < 0 ? -eye : eye, away = facing < 1 ? 1 - facing : 0;
+    const float turned = one - (eye < 0 ? -lamp : lamp);
+    return 1 - relief * turned / (1 + (turned > 0 ? turned : 0) / 2) - rim * away * away; /* no face is black */
+}
+
+/* Colours of values at the points, in their light, on pixels of finer x finer of the above; each has four bytes.
+   eye, lamp: see light_of. table: colours, of low first and high last. */
 void paint(const double *places, const int32_t *triangles, const int32_t *index, int32_t width, int32_t height,
-           int32_t finer, const float *values, const float *facing, float darkest, float low, float high,
-           const float *table, int32_t colours, uint8_t *image)
+           int32_t finer, const float *values, const float *eye, const float *lamp, float one, float relief, float rim,
+           float low, float high, const float *table, int32_t colours, uint8_t *image)
 {
     int32_t last = -1;
     struct weights it = {0, 0, 0, 0, 0, 0};
@@ -95,11 +105,14 @@ void paint(const double *places, const int32_t *triangles, const int32_t *index,
                     const float v = (float)(it.v0 + right * it.vx + down * it.vy);
                     const float w = (float)(it.w0 + right * it.wx + down * it.wy), u = 1 - v - w;
                     const float value = u * values[p[0]] + v * values[p[1]] + w * values[p[2]];
-                    const float away = 1 - (u * facing[p[0]] + v * facing[p[1]] + w * facing[p[2]]);
-                    const float light = away > 0 ? 1 - darkest * away * away : 1;
+                    const float light = light_of(u * eye[p[0]] + v * eye[p[1]] + w * eye[p[2]],
+                                                 u * lamp[p[0]] + v * lamp[p[1]] + w * lamp[p[2]], one, relief, rim);
                     const float place = (value - low) / (high - low) * (colours - 1) + 0.5f;
                     const int32_t k = !(place > 0) ? 0 : place >= colours ? colours - 1 : (int32_t)place;
-                    for (int c = 0; c < 3; c++) sum[c] += light * table[3 * k + c];
+                    for (int c = 0; c < 3; c++) {
+                        const float lit = light * table[3 * k + c];
+                        sum[c] += lit < 0 ? 0 : lit > 1 ? 1 : lit;
+                    }
                     covered++;
                 }
             for (int c = 0; c < 3; c++) image[c] = covered ? (uint8_t)(255 * sum[c] / covered + 0.5f) : 255;

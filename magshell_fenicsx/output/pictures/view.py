@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # takes long to import
 from collections.abc import Sequence
 
 from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -56,7 +57,7 @@ class Tessellation:
         return np.asarray(np.matmul(self.table, flat).reshape(-1, *values.shape[1:]))
 
     def normals(self, r: Array) -> Array:
-        """Unit normals (m q, 3) of the surface with nodes at r (n, 3); of either sign."""
+        """Unit normals (m q, 3) of the surface with nodes at r (n, 3), one sign for each piece."""
         along = np.matmul(self.slopes[:, None], r[self.nodes])
         found = np.cross(*along).reshape(-1, 3)
         if self.flat:
@@ -133,10 +134,12 @@ Image = NDArray[np.uint8]
 FUNCTIONS = """
     void rasterise(const double *, const int32_t *, int64_t, int32_t, int32_t, int32_t *, float *);
     void paint(const double *, const int32_t *, const int32_t *, int32_t, int32_t, int32_t, const float *,
-               const float *, float, float, float, const float *, int32_t, uint8_t *);
+               const float *, const float *, float, float, float, float, float, const float *, int32_t, uint8_t *);
 """
 FINER = 2  # drawn pixels along each side of a pixel of the picture
-DARKEST = 0.45  # loss of light where the surface is seen edgewise; none where it faces the eye
+LAMP = (-0.45, 0.55, 0.7)  # the way to the lamp: to the right, up, towards the eye
+RELIEF = 0.5  # of the light comes from the lamp, and falls on slopes alone
+RIM = 0.12  # loss of light where the surface is seen edgewise
 AROUND = 0.02  # margin around what is drawn, over its largest side
 
 
@@ -206,9 +209,11 @@ class Seen:
         library()[1].rasterise(*corners, len(pieces.triangles), width, height, *pixels)
 
     @cached_property
-    def _facing(self) -> NDArray[np.float32]:
-        """Cosines between normals and the direction to the eye, at points."""
-        return np.asarray(np.abs(self._pieces.normals(self._r) @ self.camera.axes[2]), np.float32)
+    def _lit(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+        """Cosines between normals and the ways to the eye and to the lamp, at points, and between these ways."""
+        normals, lamp = self.camera(self._pieces.normals(self._r)), np.array(LAMP) / np.linalg.norm(LAMP)
+        eye, to_lamp = (np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp))
+        return eye, to_lamp, float(lamp[2])
 
     @staticmethod
     def of(surface: Surface, camera: Camera, window: Window) -> "Seen":
@@ -217,25 +222,30 @@ class Seen:
     @property
     def share(self) -> Array:
         """How much of each pixel of the picture the surface covers."""
-        covered = (self._index >= 0).view(np.uint8)
-        found = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
-        return np.asarray(found / FINER**2)
+        return in_pixels(self.depth > -np.inf)
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """Of what is in front, towards the eye, at FINER drawn pixels for each; -inf where the surface is not."""
+        return self._depth
 
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
         """The image (height, width, 4) of values (n,) at nodes; transparent around the surface."""
-        return self._painted(self._pieces.at(values), limits, colours(np.arange(colours.N))[:, :3])
+        return self.painted(self._pieces.at(values), limits, colours(np.arange(colours.N))[:, :3])
 
     def plain(self, grey: float) -> Image:
         """The image of a surface in one grey."""
-        return self._painted(np.zeros(len(self._places)), (0.0, 1.0), np.full((1, 3), grey))
+        return self.painted(np.zeros(len(self._places)), (0.0, 1.0), np.full((1, 3), grey))
 
-    def _painted(self, values: Array, limits: tuple[float, float], table: Array) -> Image:
+    def painted(self, values: Array, limits: tuple[float, float], table: Array) -> Image:
+        """The image of values at the points, in the colours (n, 3) of a table."""
         height, width = self.window.shape
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
+        *lit, one = self._lit
         library()[1].paint(
             *_pointers(self._places, self._pieces.triangles, self._index),
-            *(width, height, FINER, *_pointers(numbers, self._facing), DARKEST, *limits),
+            *(width, height, FINER, *_pointers(numbers, *lit), one, RELIEF, RIM, *limits),
             *(*_pointers(colours), len(colours), *_pointers(image)),
         )
         return image
@@ -251,6 +261,13 @@ class Seen:
         front = np.full(len(places), -np.inf)
         front[inside] = self._depth[y[inside], x[inside]]
         return np.asarray(at[:, 2] > front - within)
+
+
+def in_pixels(there: NDArray[np.bool_]) -> Array:
+    """How much of each pixel of the picture a part of the drawn pixels covers."""
+    covered = there.view(np.uint8)
+    found = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
+    return np.asarray(found / FINER**2)
 
 
 @cache
@@ -321,6 +338,13 @@ def near_outlines(surface: Surface) -> tuple[Array, ...]:
     whole = _joined(surface.outlines, SAME * reach)
     far = {number for line, number in zip(surface.outlines, whole, strict=True) if _farthest(line, middle) > reach}
     return tuple(line for line, number in zip(surface.outlines, whole, strict=True) if number not in far)
+
+
+def near_solids(surface: Surface) -> tuple[Solid, ...]:
+    """The same of their faces."""
+    r = surface.r0 + surface.u
+    middle, reach = r.mean(axis=0), FAR * float(np.ptp(r, axis=0).max())
+    return tuple(solid for solid in surface.solids if _farthest(solid.points, middle) <= reach)
 
 
 def _farthest(line: Array, middle: Array) -> float:

@@ -19,8 +19,8 @@
   const scaled = it => Float32Array.from(array(it), v => it.low + it.step * v);
   const r0 = scaled(about.r0), triangles = array(about.triangles), count = r0.length / 3;
   const shifts = about.u.map(scaled);
-  const each = (values, c) => { const out = new Float32Array(count); for (let i = 0; i < count; i++) out[i] = values[3 * i + c]; return out; };
-  const corner = c => { const out = new Uint32Array(triangles.length / 3); for (let i = 0; i < out.length; i++) out[i] = triangles[3 * i + c]; return out; };
+  const each = (values, c) => { const out = new Float32Array(values.length / 3); for (let i = 0; i < out.length; i++) out[i] = values[3 * i + c]; return out; };
+  const corner = (c, of = triangles) => { const out = new Uint32Array(of.length / 3); for (let i = 0; i < out.length; i++) out[i] = of[3 * i + c]; return out; };
   const signed = [[0, "#053061"], [0.1, "#2166ac"], [0.2, "#4393c3"], [0.3, "#92c5de"], [0.4, "#d1e5f0"], [0.5, "#ffffff"],
     [0.6, "#fddbc7"], [0.7, "#f4a582"], [0.8, "#d6604d"], [0.9, "#b2182b"], [1, "#67001f"]];
   const state = {frame: about.opens, field: 0, factor: 1};
@@ -28,7 +28,21 @@
   const option = (select, value, text) => { const o = document.createElement("option"); o.value = value; o.innerHTML = text; select.append(o); };
   about.fields.forEach((f, i) => option(part("field"), i, f.label));
   for (const select of ["across", "up"]) for (const [name, c] of Object.entries(about.columns)) option(part(select), name, c.label);
-  [part("across").value, part("up").value] = about.axes;
+  about.steps.forEach((s, i) => option(part("step"), i, s.title));
+  if (about.steps.length > 1) option(part("step"), -1, "all steps"); else part("steps").hidden = true;
+  const last = a => a[a.length - 1];
+  const stepOf = frame => { // the last one that has the point as its own
+    const row = about.frames[frame];
+    for (let i = about.steps.length - 1; i >= 0; i--) if (about.steps[i].rows.slice(1).includes(row)) return i;
+    return 0;
+  };
+  const choose = step => {
+    part("step").value = step;
+    const s = step < 0 ? last(about.steps) : about.steps[step];
+    if (s) [part("across").value, part("up").value] = s.axes;
+    else [part("across").value, part("up").value] = Object.keys(about.columns);
+  };
+  choose(stepOf(state.frame));
   part("slider").max = about.frames.length - 1;
   part("slider").value = state.frame;
 
@@ -40,18 +54,32 @@
       if (v < low[c]) low[c] = v;
       if (v > high[c]) high[c] = v;
     }
-    about.lines.flat(2).forEach((v, i) => { const c = i % 3; low[c] = Math.min(low[c], v); high[c] = Math.max(high[c], v); });
+    const beside = [about.lines.flat(3), ...about.solids.flat().map(s => scaled(s.r))];
+    for (const places of beside) places.forEach((v, i) => { const c = i % 3; low[c] = Math.min(low[c], v); high[c] = Math.max(high[c], v); });
     const most = Math.max(...high.map((h, c) => h - low[c]));
     return low.map((l, c) => [l - 0.03 * most, high[c] + 0.03 * most]);
   };
   const values = () => { const f = about.fields[state.field], at = f.at[Math.min(state.frame, f.at.length - 1)]; return Float32Array.from(array(at), v => f.low + (f.high - f.low) * v / 255); };
+  const lamp = (() => { // from the upper left, as in the pictures
+    const d = about.camera, n = Math.hypot(...d), t = d.map(v => v / n), size = Math.hypot(t[0], t[1]) || 1;
+    const right = [-t[1] / size, t[0] / size, 0], up = [-t[2] * right[1], t[2] * right[0], t[0] * right[1] - t[1] * right[0]];
+    const way = t.map((v, i) => 0.7 * v - 0.45 * right[i] + 0.55 * up[i]);
+    return {x: -1e4 * way[0], y: -1e4 * way[1], z: -1e4 * way[2]}; // Plotly takes where the light goes
+  })();
+  const lighting = {ambient: 0.62, diffuse: 0.45, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0};
+  const poles = [[0, "#5a85c7"], [0.5, "#5a85c7"], [0.5, "#cc5c54"], [1, "#cc5c54"]];
+  const solids = () => about.solids[state.frame].map(s => {
+    const r = scaled(s.r), of = array(s.triangles);
+    const drawn = {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0, of), j: corner(1, of), k: corner(2, of),
+      flatshading: false, lightposition: lamp, lighting, hovertemplate: `${s.name}<extra></extra>`, showscale: false};
+    return s.poles.length ? {...drawn, intensity: s.poles, cmin: -1, cmax: 1, colorscale: poles} : {...drawn, color: "#8a9c9c", opacity: 0.35};
+  });
   const shell = () => {
     const r = deformed(), f = about.fields[state.field];
     return {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0), j: corner(1), k: corner(2),
       intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.low < 0 ? signed : "Viridis",
       colorbar: {title: {text: f.label, side: "right"}, thickness: 12, len: 0.7, exponentformat: "power"}, flatshading: false,
-      lightposition: {x: -1e4 * about.camera[0], y: -1e4 * about.camera[1], z: -1e4 * about.camera[2]},
-      lighting: {ambient: 0.72, diffuse: 0.28, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0},
+      lightposition: lamp, lighting,
       hovertemplate: "%{intensity:.4g}<extra></extra>"};
   };
   const lines = () => {
@@ -72,48 +100,125 @@
   const scene = box => {
     const most = Math.max(...box.map(b => b[1] - b[0])), d = about.camera, n = Math.hypot(...d);
     const axis = b => ({visible: false, range: b, autorange: false});
-    const ratio = box.map(b => 1.3 * (b[1] - b[0]) / most);
+    const pane = part("shell3d"), fits = Math.min(1, 0.8 * pane.clientWidth / pane.clientHeight); // beside the colour bar
+    const ratio = box.map(b => 1.3 * fits * (b[1] - b[0]) / most);
     return {xaxis: axis(box[0]), yaxis: axis(box[1]), zaxis: axis(box[2]), aspectmode: "manual",
       aspectratio: {x: ratio[0], y: ratio[1], z: ratio[2]}, uirevision: "kept",
       camera: {eye: {x: 1.6 * d[0] / n, y: 1.6 * d[1] / n, z: 1.6 * d[2] / n}, up: {x: 0, y: 0, z: 1}, projection: {type: "orthographic"}}};
   };
   const plain = {displaylogo: false, responsive: true, displayModeBar: "hover"};
-  const drawShell = () => { const box = bounds(); return Plotly.react("shell3d", [shell(), lines(), triad(box)],
+  const drawShell = () => { const box = bounds(); return Plotly.react("shell3d", [shell(), ...solids(), lines(), triad(box)],
     {scene: scene(box), margin: {l: 0, r: 0, t: 0, b: 0}, uirevision: "kept", showlegend: false}, plain); };
 
-  const on = name => { const sign = about.signs[name] ?? 1; return about.columns[name].values.map(v => sign * v); };
-  const label = name => ((about.signs[name] ?? 1) < 0 ? "− " : "") + about.columns[name].label;
-  const drawCurve = () => {
-    const x = on(part("across").value), y = on(part("up").value), traces = [];
-    const rows = about.points.map((_, i) => i);
-    for (const branch of new Set(about.branches)) {
-      const own = rows.filter(i => about.branches[i] === branch && about.labels[i] !== "solution");
-      if (!own.length) continue;
-      traces.push({x: own.map(i => x[i]), y: own.map(i => y[i]), customdata: own, mode: "lines+markers", line: {color: "#1f77b4", width: 1.5},
-        marker: {size: 5, color: own.map(i => about.unstable[i] ? "#ffffff" : "#1f77b4"), line: {color: "#1f77b4", width: 1}}, showlegend: false,
-        hovertemplate: own.map(i => `point ${about.points[i]}: ${about.labels[i]}<br>%{x:.6g}, %{y:.6g}<extra></extra>`)});
+  // The same curves as in curve.png (output/pictures/lines.py): cubics with limited slopes, over the time splines.
+  const fine = 16, steepest = 3;
+  const hermite = (t, v, slopes) => {
+    const out = [];
+    for (let i = 0; i + 1 < t.length; i++) {
+      const h = t[i + 1] - t[i];
+      for (let k = 0; k < fine; k++) {
+        const s = k / fine, r = 1 - s;
+        out.push((1 + 2 * s) * r * r * v[i] + s * r * r * h * slopes[i] + s * s * (3 - 2 * s) * v[i + 1] - s * s * r * h * slopes[i + 1]);
+      }
     }
-    const located = rows.filter(i => about.labels[i] === "fold" || about.labels[i] === "bifurcation");
-    traces.push({x: located.map(i => x[i]), y: located.map(i => y[i]), customdata: located, mode: "markers+text", text: located.map((_, n) => `${n + 1}`),
-      textposition: "top left", marker: {size: 9, color: "#d62728"}, hovertemplate: located.map(i => `${about.labels[i]}<br>%{x:.6g}, %{y:.6g}<extra></extra>`), showlegend: false});
-    const found = rows.filter(i => about.labels[i] === "solution");
-    traces.push({x: found.map(i => x[i]), y: found.map(i => y[i]), customdata: found, mode: "markers", marker: {size: 8, symbol: "square", color: "#2ca02c"}, showlegend: false});
+    out.push(last(v));
+    return out;
+  };
+  const limited = (slope, a) => Math.max(-steepest * a, Math.min(steepest * a, slope));
+  const end = (h1, h2, a, b) => { const s = ((2 * h1 + h2) * a - h1 * b) / (h1 + h2); return s * a <= 0 ? 0 : limited(s, Math.abs(a)); };
+  const slopesOf = (t, v, located) => {
+    const h = t.slice(1).map((x, i) => x - t[i]), d = h.map((x, i) => (v[i + 1] - v[i]) / x), m = h.length;
+    if (m === 1) return [d[0], d[0]];
+    const most = i => d[i - 1] * d[i + 1] < 0 ? Infinity : Math.abs(d[i]); // it turns between these two points
+    const out = [end(h[0], h[1], d[0], d[1])];
+    for (let i = 1; i < m; i++) out.push(located[i] && d[i - 1] * d[i] < 0 ? 0
+      : limited((h[i] * d[i - 1] + h[i - 1] * d[i]) / (h[i - 1] + h[i]), Math.min(most(i - 1), most(i))));
+    return [...out, end(h[m - 1], h[m - 2], d[m - 1], d[m - 2])];
+  };
+  const splineSlopes = (t, v) => { // not-a-knot: two unknowns in the first and the last row, three in the others
+    const n = t.length, h = t.slice(1).map((x, i) => x - t[i]), d = h.map((x, i) => (v[i + 1] - v[i]) / x);
+    const low = new Float64Array(n), middle = new Float64Array(n), up = new Float64Array(n), right = new Float64Array(n);
+    const edge = (i, h1, h2, d1, d2) => { middle[i] = h2; right[i] = ((h1 + 2 * (h1 + h2)) * h2 * d1 + h1 * h1 * d2) / (h1 + h2); return h1 + h2; };
+    up[0] = edge(0, h[0], h[1], d[0], d[1]);
+    for (let i = 1; i < n - 1; i++) { low[i] = h[i]; middle[i] = 2 * (h[i - 1] + h[i]); up[i] = h[i - 1]; right[i] = 3 * (h[i] * d[i - 1] + h[i - 1] * d[i]); }
+    low[n - 1] = edge(n - 1, h[n - 2], h[n - 3], d[n - 2], d[n - 3]);
+    for (let i = 1; i < n; i++) { const f = low[i] / middle[i - 1]; middle[i] -= f * up[i - 1]; right[i] -= f * right[i - 1]; }
+    const out = new Array(n);
+    for (let i = n - 1; i >= 0; i--) out[i] = (right[i] - (i + 1 < n ? up[i] * out[i + 1] : 0)) / middle[i];
+    return out;
+  };
+  const joined = (x, y, located, times) => {
+    const later = times && times.map((t, i) => i === 0 || t > times[i - 1]);
+    if (later && later.filter(Boolean).length >= 4 && later.slice(2).every(Boolean)) {
+      const skip = later[1] ? 0 : 1, rest = v => v.slice(skip), t = rest(times);
+      const curve = [x, y].map(v => hermite(t, rest(v), splineSlopes(t, rest(v))));
+      if (skip) curve.forEach((c, k) => { const v = [x, y][k]; for (let i = fine - 1; i >= 0; i--) c.unshift(v[0] + i / fine * (v[1] - v[0])); });
+      return curve;
+    }
+    if (x.length < 2) return [x, y];
+    const span = v => Math.max(...v) - Math.min(...v) || 1, chord = [0];
+    for (let i = 1; i < x.length; i++) chord.push(last(chord) + Math.sqrt(Math.max(Math.hypot((x[i] - x[i - 1]) / span(x), (y[i] - y[i - 1]) / span(y)), 1e-12)));
+    return [x, y].map(v => hermite(chord, v, slopesOf(chord, v, located)));
+  };
+
+  const on = name => about.columns[name].values.map(v => about.columns[name].sign * v);
+  const palette = ["#1f77b4", "#ff7f0e", "#9467bd", "#8c564b", "#17becf", "#7f7f7f", "#bcbd22", "#e377c2"];
+  const isLocated = i => about.labels[i] === "fold" || about.labels[i] === "bifurcation";
+  const drawCurve = () => {
+    const x = on(part("across").value), y = on(part("up").value), traces = [], step = +part("step").value;
+    const shown = step < 0 ? about.steps : about.steps.slice(step, step + 1), dashes = {false: "solid", true: "dash"};
+    const hover = i => `point ${about.points[i]}: ${about.labels[i]}${about.unstable[i] ? ", unstable" : ""}<br>%{x:.6g}, %{y:.6g}<extra></extra>`;
+    const named = new Set(), once = name => { const first = !named.has(name); named.add(name); return {name, showlegend: first, legendgroup: name}; };
+    const within = new Set(shown.flatMap(s => s.rows)), several = new Set();
+    shown.forEach((s, n) => {
+      const color = palette[n % palette.length];
+      for (const l of s.lines) {
+        const pick = v => l.rows.map(i => v[i]), is = l.rows;
+        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null);
+        for (const [first, end, unstable] of l.pieces) {
+          const cut = v => v.slice(first * fine, end * fine + 1), name = (step < 0 ? s.title + ", " : "") + (unstable ? "unstable" : "stable");
+          several.add(unstable);
+          traces.push({x: cut(curve[0]), y: cut(curve[1]), mode: "lines", line: {color, width: 1.6, dash: dashes[unstable]}, hoverinfo: "skip", ...once(name)});
+        }
+        const dots = is.filter(i => !isLocated(i));
+        traces.push({x: dots.map(i => x[i]), y: dots.map(i => y[i]), customdata: dots, mode: "markers", marker: {size: 5, color}, hovertemplate: dots.map(hover), showlegend: false});
+      }
+    });
+    const numbers = {}; about.points.map((_, i) => i).filter(isLocated).forEach((i, n) => { numbers[i] = n + 1; });
+    for (const [kind, symbol] of [["fold", "circle-open"], ["bifurcation", "diamond-open"]]) {
+      const here = [...within].filter(i => about.labels[i] === kind);
+      if (here.length) traces.push({x: here.map(i => x[i]), y: here.map(i => y[i]), customdata: here, mode: "markers+text", text: here.map(i => `${numbers[i]}`), textposition: "top left",
+        marker: {size: 8, symbol, color: "#d62728", line: {width: 2}}, hovertemplate: here.map(hover), ...once(kind)});
+    }
+    const found = [...within].filter(i => about.labels[i] === "solution");
+    if (found.length) traces.push({x: found.map(i => x[i]), y: found.map(i => y[i]), customdata: found, mode: "markers", hovertemplate: found.map(hover),
+      marker: {size: 8, symbol: found.map(i => about.unstable[i] ? "square-open" : "square"), color: "#2ca02c"}, ...once("solution")});
     const now = about.frames[state.frame];
     traces.push({x: [x[now]], y: [y[now]], mode: "markers", marker: {size: 13, color: "rgba(0,0,0,0)", line: {color: "#000", width: 2}}, hoverinfo: "skip", showlegend: false});
-    const axis = name => ({title: {text: label(part(name).value), standoff: 8}, zeroline: true, zerolinecolor: "#ccc", showline: true, mirror: true, ticks: "outside", showgrid: false, exponentformat: "power"});
-    return Plotly.react("curve2d", traces, {xaxis: axis("across"), yaxis: axis("up"), margin: {l: 70, r: 15, t: 10, b: 55}, hovermode: "closest"}, {...plain, displayModeBar: false});
+    const axis = name => ({title: {text: about.columns[part(name).value].label, standoff: 8}, automargin: true, zeroline: true, zerolinecolor: "#ccc", showline: true, mirror: true, ticks: "outside", showgrid: false, exponentformat: "power"});
+    return Plotly.react("curve2d", traces, {xaxis: axis("across"), yaxis: axis("up"), margin: {l: 60, r: 12, t: 10, b: 45}, hovermode: "closest",
+      showlegend: several.size > 1 || named.size > 1, legend: {orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: {size: 11}}}, {...plain, displayModeBar: false});
   };
   const tell = () => {
-    const i = about.frames[state.frame], c = about.columns[about.varied];
+    const i = about.frames[state.frame], s = about.steps[stepOf(state.frame)], c = s && about.columns[s.axes.find(n => n === s.varied)] || (s && about.columns[s.varied]);
     part("said").innerHTML = `point ${about.points[i]} (${about.labels[i]})` + (c ? `: ${c.label} = ${c.values[i].toPrecision(6)}` : "") + (about.unstable[i] ? ", unstable" : "");
   };
-  const go = async frame => { state.frame = frame; part("slider").value = frame; tell(); await Promise.all([drawShell(), drawCurve()]); };
+  const go = async frame => {
+    state.frame = frame;
+    part("slider").value = frame;
+    const step = +part("step").value;
+    if (step >= 0 && about.steps[step] && !about.steps[step].rows.includes(about.frames[frame])) choose(stepOf(frame));
+    tell();
+    await Promise.all([drawShell(), drawCurve()]);
+  };
   tell();
   await Promise.all([drawShell(), drawCurve()]);
   part("slider").oninput = e => go(+e.target.value);
   part("field").onchange = e => { state.field = +e.target.value; drawShell(); };
   part("factor").onchange = e => { state.factor = +e.target.value; drawShell(); };
   part("across").onchange = part("up").onchange = drawCurve;
+  part("step").onchange = e => { choose(+e.target.value); drawCurve(); };
+  window.magshell = {about, joined, bounds}; // for tests
   part("curve2d").on("plotly_click", e => {
     const row = e.points[0].customdata;
     if (row === undefined) return;

@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, couple
-from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, run_camera, tessellated
+from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
+from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, near_solids, run_camera, tessellated
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
-from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name, read_rows
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
 from magshell_fenicsx.platform.kept import keep, recall
-from magshell_fenicsx.quantities.registry import amplitude, axes_of, quantity
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 SAME = 1e-7  # places over R that are one vertex
@@ -127,6 +130,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
         "triangles": packed.raw(mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)),
         "u": [packed.add(mesh.at(s.u), np.int16) for s in shells],
         "lines": [[np.round(line, 4).tolist() for line in near_outlines(s)] for s in shells],
+        "solids": [[_solid(solid, packed) for solid in near_solids(s)] for s in shells],
         "fields": _fields(shells, mesh, about.h, packed),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
@@ -134,40 +138,102 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
     return Interactive(Markup(text), packed.content, library, Markup(script))
 
 
+def _solid(solid: Solid, packed: "_Packed") -> dict[str, Any]:
+    """The faces of a body or a magnet; the sign of its poles at its corners."""
+    poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
+    triangles = packed.raw(solid.triangles.astype(np.uint16))
+    return {"name": solid.name, "r": packed.add(solid.points, np.uint16), "triangles": triangles, "poles": poles}
+
+
 def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
-    """At most about so many rows of a path, evenly, besides the first, the last, and instabilities and solutions."""
+    """At most about so many rows of a path, besides the first, the last, and instabilities and solutions.
+
+    Between them the shape changes about equally: a snap has as many as the slow part before it.
+    """
     special = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: most // 2]
     others = [row for row in rows if row not in special]
     count = min(len(others), max(most - len(special), 2))
-    even = [others[round(i * (len(others) - 1) / max(count - 1, 1))] for i in range(count)]
-    return sorted([*special, *even], key=lambda row: int(row["point"]))
+    way = _way(others)
+    even = {int(np.abs(way - at).argmin()) for at in np.linspace(0, way[-1], count)} | {0, len(others) - 1}
+    left = [i for i in range(len(others)) if i not in even]
+    more = count - len(even)
+    even |= {left[round(i * (len(left) - 1) / max(more - 1, 1))] for i in range(min(more, len(left)))}
+    return sorted([*special, *(others[i] for i in even)], key=lambda row: int(row["point"]))
+
+
+def _way(rows: Sequence[Row]) -> Array:
+    """How far the shape has changed until each row: of all displacements over their range, and half of it per point."""
+    moved = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
+    values = np.array([[float(row[name]) for name in moved] for row in rows]).reshape(len(rows), -1)
+    ranges = np.ptp(values, axis=0)
+    steps = np.abs(np.diff(values[:, ranges > 0] / ranges[ranges > 0], axis=0)).sum(axis=1)
+    share = 0.5 * (float(steps.sum()) or 1.0) / max(len(steps), 1)
+    return np.concatenate([[0.0], np.cumsum(steps + share)])
 
 
 def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
-    """The numbers of path.csv that vary, names of columns, and the axes that the curve begins with."""
+    """The numbers of path.csv that vary, names of columns, and the lines of the curve of each step."""
+    varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
+    parts = _parts(rows, varied) if varied else []
+    known = {each.name: each for name in rows[0] for q in [quantity(name)] for each in (q, *q.in_units)}
+    first = list[str]()
+    for part in reversed(parts):  # its words say whose displacement it is
+        known |= {q.name: q for q in axes_for(part)}
+        first += [q.name for q in axes_for(part)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
     varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
-    varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
-    axes = [q.name for q in axes_of(varied, rows[0])] if varied else varying[:2]
-    names = list(dict.fromkeys([*axes, *varying]))
-    labels = {name: _label(name, rows[0], pole) for name in names}
+    columns = {}
+    for name in dict.fromkeys([*first, *varying]):
+        it = known.get(name) or quantity(name)
+        values = [row[name] for row in rows]
+        columns[name] = {"label": label(it, rows[0], pole), "values": values, "sign": it.sign}
     return {
-        "columns": {name: {"label": labels[name], "values": [row[name] for row in rows]} for name in names},
-        "signs": {q.name: q.sign for q in axes_of(varied, rows[0])} if varied else {},
-        "axes": axes,
+        "columns": columns,
+        "steps": [_step(part, rows) for part in parts],
         "points": [row["point"] for row in rows],
         "labels": [row["label"] for row in rows],
-        "branches": [row["branch"] for row in rows],
-        "unstable": [int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0 for row in rows],
-        "varied": quantity(amplitude(varied).column).name if varied else "",
+        "unstable": [is_unstable(row) for row in rows],
+        "times": [row["time"] for row in rows] if "time" in rows[0] else [],
     }
 
 
-def _label(name: str, row: Row, pole: str) -> str:
-    known = quantity(name)
-    words = f"{known.words} {known.note}".strip().replace(POLE, pole_name(row, pole))
-    unit = f" ({known.shown_unit})" if known.shown_unit else ""
-    return str(Markup("{}{}{}").format(words, Markup(f" {known.html}") if known.symbol else "", unit))
+def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:
+    """A step for the page: numbers of its rows, and the lines between them."""
+    at = {int(row["point"]): i for i, row in enumerate(rows)}
+    varied = quantity(amplitude(part.amplitude).column)
+    return {
+        "title": part.title or varied.words,
+        "axes": [q.name for q in axes_for(part)],
+        "varied": varied.name,
+        "rows": [at[int(row["point"])] for row in part.rows],
+        "lines": [
+            {"rows": [at[int(row["point"])] for row in it.rows], "pieces": it.pieces, "in_time": it.in_time}
+            for it in lines_of(part)
+        ],
+    }
+
+
+def _parts(rows: Sequence[Row], varied: str) -> list[Part]:
+    """The steps of a curve as in curve.png, after those that it leaves out, such as the field before the loads."""
+    drawn = drawn_parts(rows, varied)
+    among = {int(row["point"]) for part in drawn for row in part.rows}
+    before = [row for row in rows if int(row["point"]) not in among]
+    names = list(dict.fromkeys(str(row["amplitude"]) for row in before if row["amplitude"]))
+    others = []
+    for name in names:
+        own = [row for row in before if row["amplitude"] == name]
+        first = max(rows.index(own[0]) - 1, 0)
+        others.append(Part(name, [*rows[first : first + 1], *own] if rows[first] is not own[0] else own))
+    return [part for part in (*others, *drawn) if len(part.rows) > 1]
+
+
+def label(known: Quantity, row: Row, pole: str) -> str:
+    """The label of an axis, as in curve.png, in HTML."""
+    there = named(known, row, pole)
+    words = f"{there.words} {there.note}".strip()
+    unit = f" ({there.shown_unit})" if there.shown_unit else ""
+    minus = "−" if there.sign < 0 else ""
+    return str(Markup("{}{}{}").format(words, Markup(f" {minus}{there.html}") if there.symbol else "", unit))
 
 
 def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed") -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, 
 ROUNDING = 1e-15, 1e-9  # displacements and forces as small as this, in any unit or over their largest, are zero
 LEAST, MOST = 1e-3, 1e6  # magnitudes between them are written without a power of ten
 DIGITS = 6
+LEAST_BEYOND = 0.1  # per cent of an overshoot
 Summary = Mapping[str, Any]
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
 
@@ -202,12 +203,26 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         )
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
+    sentences += _snaps(summary)
     sentences += _error(summary)
     sentences += [Markup("{}.").format(remark[0].upper() + remark[1:]) for remark in summary.get("remarks", [])]
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
         sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
     return Markup(" ").join(sentences)
+
+
+def _snaps(summary: Summary) -> list[Markup]:
+    """How long the first snap takes until half way, and how far beyond its end it goes."""
+    if not (found := summary.get("snaps")):
+        return []
+    time = summary.get("snap_time_ms")
+    took = (
+        Markup("{} ms").format(number(time, 4)) if time else Markup("the time {}").format(number(found[0]["time"], 4))
+    )
+    beyond = 100 * float(found[0]["overshoot"])
+    more = Markup(", and overshoots by {} % of its way").format(number(beyond, 2)) if beyond > LEAST_BEYOND else ""
+    return [Markup("The snap takes {} until half way{}.").format(took, more)]
 
 
 def _error(summary: Summary) -> list[Markup]:

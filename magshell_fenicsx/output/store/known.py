@@ -39,6 +39,8 @@ SHAPE: dict[str, Any] = {
     "gradients?": {"*": {"value": NUMBER, "numbers": NUMBERS, "fields": dict}},
     "knockdown": (*NUMBER, NOTHING),
     "barrier?": (*NUMBER, NOTHING),
+    "snaps?": [{"time": NUMBER, "overshoot": NUMBER}],
+    "snap_time_ms?": NUMBER,
     "solutions?": [{"point": int, "stable": bool, "residual": NUMBER}],
     "points": int,
     "mesh": dict.fromkeys(("cells", "dofs", "degree"), int),

@@ -23,7 +23,7 @@ DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions
 NAMES = re.compile(
     r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"
     rf"|({'|'.join(DRAWN)})(_\d{{4,}})?\.(png|svg|pdf)"
-    r"|fields(/(path\.pvd|outlines(_\d{4,})?\.vtp|(point_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
+    r"|fields(/((path|whole)\.pvd|outlines(_\d{4,})?\.vtp|((point|whole)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
 )
 
 

@@ -15,6 +15,7 @@ from magshell_fenicsx.input.section import Section, lengths_with_units, or_numbe
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.shape.ground import At, Coordinates
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 Axis = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)]
@@ -33,6 +34,11 @@ class Distance(ABC):
     @abstractmethod
     def lines(self) -> list[Array]:
         """Its outline: places (n, 3) along lines."""
+
+    @property
+    def solid(self) -> Solid | None:
+        """Its faces; None of a body without."""
+        return None
 
     @property
     def held(self) -> Sequence[Array]:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size, rounded
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import edges
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -63,6 +65,10 @@ class Box(Distance):
     @property
     def lines(self) -> list[Array]:
         return [self.centre + line @ self.axes for line in edges(-self.half, self.half)]
+
+    @property
+    def solid(self) -> Solid:
+        return solids.block(self.half).moved(self.axes.T, self.centre)
 
     @property
     def across(self) -> Sequence[Array]:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
 from magshell_fenicsx.parts.bodies.sphere import Sphere
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import SEEN, frame, upright
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,10 @@ class Cylinder(Distance):
     @property
     def lines(self) -> list[Array]:
         return [self.centre + line @ frame(self.axis).T for line in upright(self.radius, 2 * SEEN)]
+
+    @property
+    def solid(self) -> Solid:
+        return solids.cylinder(self.radius, 2 * SEEN).moved(frame(self.axis), self.centre)
 
     @property
     def held(self) -> Sequence[Array]:

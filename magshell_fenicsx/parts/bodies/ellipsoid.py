@@ -1,7 +1,7 @@
 """An ellipsoid."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import ball
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 STEPS = 60  # of Newton's method, which takes about six
@@ -85,6 +87,11 @@ class Ellipsoid(Distance):
     @property
     def lines(self) -> list[Array]:
         return [self.centre + self.semi * line @ self.axes for line in ball(1.0)]
+
+    @property
+    def solid(self) -> Solid:
+        round_one = solids.globe(1.0)
+        return replace(round_one, points=self.semi * round_one.points).moved(self.axes.T, self.centre)
 
     @property
     def across(self) -> Sequence[Array]:

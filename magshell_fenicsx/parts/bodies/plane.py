@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed
-from magshell_fenicsx.shape.ground import SEEN, frame
+from magshell_fenicsx.shape import solids
+from magshell_fenicsx.shape.ground import SEEN, circle, frame
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -34,5 +36,8 @@ class Plane(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        square = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
-        return [self.front + SEEN * square @ frame(self.along).T]
+        return [self.front + circle(SEEN) @ frame(self.along).T]
+
+    @property
+    def solid(self) -> Solid:
+        return solids.disc(SEEN).moved(frame(self.along), self.front)

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size, rounded
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import SEEN, frame, upright
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -58,3 +60,7 @@ class Rod(Distance):
     def lines(self) -> list[Array]:
         middle = self.end - SEEN * self.along
         return [middle + line @ frame(self.along).T for line in upright(self.radius, 2 * SEEN)]
+
+    @property
+    def solid(self) -> Solid:
+        return solids.cylinder(self.radius, 2 * SEEN).moved(frame(self.along), self.end - SEEN * self.along)

@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import ball
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -43,3 +45,7 @@ class Sphere(Distance):
     @property
     def lines(self) -> list[Array]:
         return [self.centre + line for line in ball(self.radius)]
+
+    @property
+    def solid(self) -> Solid:
+        return solids.globe(self.radius).moved(np.eye(3), self.centre)

@@ -15,7 +15,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
-from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, WORK, Quantity
+from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, TURN, WAY, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 
 if TYPE_CHECKING:
@@ -148,7 +148,12 @@ class SourcesSeen(Seen):
 
     quantities = (
         Quantity(
-            "source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"
+            "source",
+            "source",
+            "Factor of a source's motion or strength; the step may give it another name. With units the way of a "
+            "motion has a column too, in mm or degrees.",
+            "load",
+            units=(WAY, TURN),
         ),
         Quantity(
             "source_force",
@@ -187,6 +192,10 @@ class SourcesSeen(Seen):
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
         return source_columns(loads)
+
+    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+        motions = [motion for driven in (loads.magnetic.driven if loads.magnetic else ()) for motion in driven.motions]
+        return {motion.name: (bool(motion.turns), source_size(loads, motion.name)) for motion in motions}
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         values: dict[str, float] = {}

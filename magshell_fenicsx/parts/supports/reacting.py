@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.quantities.quantity import MOMENT, REACTION, Quantity
+from magshell_fenicsx.quantities.quantity import MOMENT, REACTION, TURN, WAY, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
@@ -46,7 +46,14 @@ class Moved(Seen):
     """Motions of supports with their reactions, and the reactions of all supports."""
 
     quantities = (
-        Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
+        Quantity(
+            "motion",
+            "motion",
+            "Factor of the motion of supports; the step may give it another name. With units its way has a column too: "
+            "all translations together in mm, of rotations alone degrees.",
+            "load",
+            units=(WAY, TURN),
+        ),
         Quantity(
             "reaction",
             "reaction",
@@ -69,6 +76,9 @@ class Moved(Seen):
 
     def moments(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(column for name, column in motion_columns(loads).items() if only_turns(loads, name))
+
+    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+        return {name: (only_turns(loads, name), motion_size(loads, name)) for name in motion_columns(loads)}
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Forces and moments in the case's units."""

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import edges
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -34,3 +36,6 @@ class CuboidSection(MagnetSection):
 
     def lines(self) -> list[Array]:
         return edges(-self.half, self.half)
+
+    def solid(self) -> Solid:
+        return solids.block(self.half)

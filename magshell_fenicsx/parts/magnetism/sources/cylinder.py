@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import upright
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -31,3 +33,6 @@ class CylinderSection(MagnetSection):
 
     def lines(self) -> list[Array]:
         return upright(self.diameter / 2, self.height)
+
+    def solid(self) -> Solid:
+        return solids.cylinder(self.diameter / 2, self.height)

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import upright
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -46,3 +48,6 @@ class RingSection(MagnetSection):
 
     def lines(self) -> list[Array]:
         return [line for radius in self.radii for line in upright(radius, self.height)]
+
+    def solid(self) -> Solid:
+        return solids.cylinder(self.diameter / 2, self.height, self.inner_diameter / 2)

@@ -15,6 +15,7 @@ from pydantic import Field
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.driven import FieldInSpace
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 Values = Callable[[Array], Array]
@@ -42,11 +43,14 @@ class OwnField:
         Its outline: places (n, 3) along lines, in m.
     nowhere
         What a place without a field is.
+    solid
+        Its faces with its poles, in m; None of what is no magnet.
     """
 
     values: FieldInSpace
     lines: Sequence[Array]
     nowhere: str
+    solid: Solid | None = None
 
 
 class SourceSection(Section):
@@ -115,8 +119,14 @@ class MagnetSection(SourceSection):
     def lines(self) -> list[Array]:
         """Its outline: places (n, 3) along lines, in m."""
 
+    @abstractmethod
+    def solid(self) -> Solid:
+        """Its faces, in m."""
+
     def field(self, key: str, R: float) -> OwnField:
-        return OwnField(Harmonic(self.values(magpylib(key).magnet), self.distance), self.lines(), "inside")
+        values = Harmonic(self.values(magpylib(key).magnet), self.distance)
+        solid = self.solid().magnetised(self.strength * self.vector, self.name or f"{self.kind} magnet")
+        return OwnField(values, self.lines(), "inside", solid)
 
 
 def to_box(beyond: Array) -> Array:
@@ -174,6 +184,12 @@ class Placed:
     def lines(self) -> list[Array]:
         """Its outline: places (n, 3) along lines, over R."""
         return [self.position + line / self.length @ self.axes.T for line in self.own.lines]
+
+    @property
+    def solid(self) -> Solid | None:
+        """Its faces, over R."""
+        own = self.own.solid
+        return own.moved(self.axes, self.position, 1 / self.length) if own else None
 
 
 def magpylib(key: str) -> ModuleType:

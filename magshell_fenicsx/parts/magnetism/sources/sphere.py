@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values
+from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import ball
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -28,3 +30,6 @@ class SphereSection(MagnetSection):
 
     def lines(self) -> list[Array]:
         return ball(self.diameter / 2)
+
+    def solid(self) -> Solid:
+        return solids.globe(self.diameter / 2)

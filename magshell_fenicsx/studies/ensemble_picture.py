@@ -1,0 +1,93 @@
+"""ensemble.png: the distribution of a result over random samples, and what it depends on most."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.studies.statistics import RESULT, WITHOUT, Row, correlations, fit, results
+
+Array = NDArray[np.float64]
+KNOCKDOWN = r"knockdown factor  $k_\mathrm{d}$"
+FEW = 20  # samples: of fewer each is shown, no histogram
+TAIL = 1e-3  # probability of the lowest value that a fitted curve shows
+
+
+def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
+    """Write the picture.
+
+    Parameters
+    ----------
+    name
+        The result, as `--result` names it.
+    """
+    from matplotlib.figure import Figure
+
+    values, label = results(rows), KNOCKDOWN if name == "knockdown" else name
+    strongest = max(correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None)
+    panels = 2 + (strongest is not None)
+    figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
+    density, function, *others = figure.subplots(1, panels, squeeze=False)[0]
+    if len(values):
+        _draw_distribution(density, function, values, results(rows, WITHOUT))
+    density.set(xlabel=label, ylabel="probability density")
+    function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
+    if strongest:
+        _draw_correlation(others[0], rows, strongest[0], label)
+    for axes in figure.axes:
+        axes.locator_params(axis="x", nbins=5)  # long numbers would touch
+    figure.savefig(file)
+
+
+def _draw_distribution(density: Any, function: Any, values: Array, without: Array) -> None:
+    """The density and the distribution function, of the samples and of Weibull's distribution."""
+    fitted = fit(values)
+    if len(values) >= FEW:
+        density.hist(values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4)
+    density.plot(values, np.zeros(len(values)), "|", color="C0", markersize=14, clip_on=False, label="samples")
+    ordered, least = np.sort(values), float(values.min())
+    part = np.arange(len(values) + 1) / len(values)
+    function.step(np.append(ordered[:1], ordered), part, where="post", color="C0", label=f"{len(values)} samples")
+    if len(less := np.sort(without)):
+        part = np.arange(1, len(less) + 1) / len(less)
+        function.step(less, part, where="post", color="C2", linewidth=1, label="without the weakest defects")
+    if fitted:
+        low = max(fitted.quantile(TAIL), least - np.ptp(values))
+        x = np.linspace(min(low, least), values.max() + 0.1 * np.ptp(values), 400)
+        density.plot(x, fitted.density(x), color="C3")
+        function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
+    density.set_ylim(bottom=0)
+    function.legend(frameon=False, fontsize=8)
+
+
+def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
+    """The result over a column, with Spearman's correlation and how likely one as large is by chance."""
+    from scipy.stats import spearmanr
+
+    pairs = np.array([(row[key], row[RESULT]) for row in rows if row[RESULT] is not None and row.get(key) is not None])
+    found, chance = spearmanr(*pairs.T)
+    axes.plot(*pairs.T, ".", color="C0", markersize=5)
+    likely = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
+    number = f"{found:.2f}".replace("-", "−")
+    axes.set(xlabel=words(key), ylabel=label)
+    axes.set_title(f"Spearman's correlation {number}, $n$ = {len(pairs)}, {likely}", fontsize=9)
+
+
+def words(key: str) -> str:
+    """The label of a column of samples.csv, with its unit.
+
+    Examples
+    --------
+    >>> words("severest.amplitude_mm"), words("severest.at.polar")
+    ('amplitude of the most severe defect  (mm)', 'polar of the most severe defect  (degrees)')
+    >>> words("severest.amplitude")
+    'amplitude over $h$ of the most severe defect'
+    """
+    of, _, last = key.rpartition(".")
+    name, _, ending = last.rpartition("_")
+    name, unit = (name, "mm") if ending == "mm" else (last, "degrees" if last in ("polar", "azimuth") else "")
+    name = "amplitude over $h$" if name == "amplitude" and not unit else name.replace("_", " ")
+    whose = " of the most severe defect" if of.startswith("severest") else ""
+    return f"{name}{whose}" + (f"  ({unit})" if unit else "")

@@ -1,0 +1,167 @@
+"""Reports in a real browser: headless Chromium opens them as a reader would, on a screen and on a phone."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import PROGRAM, Page, browser
+from many import design
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+import magshell_fenicsx as ms
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.output.pictures.lines import FINE, smooth, splined
+from magshell_fenicsx.output.report.interactive import plotly
+from magshell_fenicsx.output.report.report import write_report
+
+pytestmark = [
+    pytest.mark.skipif(PROGRAM is None, reason="Chromium is not installed"),
+    pytest.mark.skipif(plotly() is None, reason="Plotly is not installed"),
+]
+SPHERE = {
+    "shell": {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+    "boundary": {"equator": "clamped"},
+}
+STRIP = {
+    "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0.0},
+    "boundary": {"root": "clamped"},
+    "mesh": {"degree": 3, "size": 0.5},
+}
+IN_UNITS = {"geometry": "strip", "radius": "30 mm", "width": 0.2, "thickness": "0.5 mm", "poisson_ratio": 0.0}
+MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
+CASES: dict[str, dict[str, Any]] = {
+    "indentation": {**SPHERE, "loading": {"kind": "indentation", "at": {"polar": 0}, "depth": 3, "points": 3}},
+    "body": {
+        **SPHERE,
+        "bodies": {"plate": {"kind": "plane"}},
+        "loading": {"kind": "contact", "approach": 1, "points": 2},
+    },
+    "magnet": {
+        **STRIP,
+        "shell": {**IN_UNITS, "youngs_modulus": "1 MPa"},
+        "magnetic": {
+            "remanent": {"polar": 90, "flux_density": "3 mT"},
+            "applied": {"sources": [{**MAGNET, "axis": {"polar": -90}, "position": ["55 mm", 0, "-30 mm"]}]},
+        },
+        "loading": [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "12 mm"], "points": 2}],
+    },
+    "time": {
+        **STRIP,
+        "loading": [
+            {"kind": "time", "duration": 1000.0, "points": 12, "push": {"mode": 1, "displacement": 0.5}},
+        ],
+    },
+}
+DESIGN = """
+shell: {geometry: strip, radius_to_thickness: 50, width: 0.2, poisson_ratio: 0}
+boundary: {root: clamped}
+points: {tip: [1, 0, 0]}
+magnetic: {lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}
+mesh: {degree: 2}
+symmetry: none
+design: {objective: {maximise: tip_uz}, remanence: {points: 2}, iterations: 1}
+"""
+KINDS = (*CASES, "design")
+SCENE = "document.getElementById('shell3d')._fullLayout.scene"
+DRAWN = "document.getElementById('shell3d')._fullData"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("browser")) as running:
+        yield running.page()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Makes, once each, the report of a kind of run."""
+    made: dict[str, Path] = {}
+
+    def make(kind: str) -> Path:
+        if kind not in made:
+            out = tmp_path_factory.mktemp(kind)
+            if kind == "design":
+                (out / "strip.yaml").write_text(DESIGN)
+                design(out / "strip.yaml", out=out / "design")
+                out = out / "design/verified"
+            else:
+                ms.run(ms.Case.from_source(Source(kind, CASES[kind])), out, pictures=kind == "body")
+            write_report(out)
+            made[kind] = out / "report.html"
+        return made[kind]
+
+    return make
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, report: Any) -> None:
+    """No error, nothing wider than the window; the shell in its true proportions, neither tiny nor cut off."""
+    for width in (1200, 400):
+        page.open(report(kind), width)
+        page.wait("document.body.dataset.ready === 'yes'")
+        assert page.errors == []
+        assert page.value("document.documentElement.scrollWidth") <= width
+        panes = page.value("['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().width)")
+        assert min(panes) >= 0.35 * width if width > 700 else 0.8 * width
+        ranges = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}[c + 'axis'].range)"), float)
+        ratio = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}.aspectratio[c])"), float)
+        assert np.isfinite(ranges).all()
+        assert page.value(f"{SCENE}.aspectmode") == "manual"
+        sizes = np.ptp(ranges, axis=1)
+        assert ratio / ratio.max() == pytest.approx(sizes / sizes.max(), rel=1e-6)  # a sphere is a sphere
+        places = page.value(
+            f"['x', 'y', 'z'].map(c => {DRAWN}.slice(0, -1).flatMap(t => [...t[c]].filter(v => v !== null)))"
+        )
+        drawn = np.array([[min(values), max(values)] for values in places])
+        assert (drawn[:, 0] >= ranges[:, 0]).all()
+        assert (drawn[:, 1] <= ranges[:, 1]).all()
+        assert np.ptp(drawn, axis=1).max() > 0.35 * sizes.max()
+
+
+def test_the_curve_is_that_of_the_picture(page: Page, report: Any) -> None:
+    """Between the points too: JavaScript's cubics against SciPy's, of a fold, a turn and a vibration."""
+    page.open(report("time"), 800)
+    page.wait("document.body.dataset.ready === 'yes'")
+    x, y, t = [0.0, 0.5, 1.1, 0.8, 0.9], [0.0, 2.0, 2.5, 1.0, 1.5], [0.0, 0.5, 1.0, 2.0, 2.5]
+    located = [False, False, True, False, False]
+    texts = ", ".join(str(v).lower() for v in (x, y, located))
+    assert np.array(page.value(f"magshell.joined({texts}, null)")) == pytest.approx(smooth(x, y, located), abs=1e-12)
+    found = np.array(page.value(f"magshell.joined({texts}, {t})"))
+    assert found == pytest.approx(splined(x, y, t), abs=1e-12)
+    assert found[1] == pytest.approx(CubicSpline(t, y)(np.interp(np.arange(4 * FINE + 1) / FINE, range(5), t)))
+    assert page.value("magshell.about.steps[0].lines[0].in_time") is True
+
+
+def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
+    """The field is not joined to the way of the magnet; labels have the units of the case; a click moves the slider."""
+    page.open(report("magnet"), 1200)
+    page.wait("document.body.dataset.ready === 'yes'")
+    about = page.value("magshell.about")
+    first, second = about["steps"]
+    assert first["rows"] == [0, 1]
+    assert second["rows"] == list(range(1, len(about["points"])))
+    assert about["columns"]["source_force_N"]["label"] == "force on the source (N)"
+    assert about["columns"]["w_pole_mm"]["label"] == "displacement of the tip w (mm)"
+    assert page.value("document.getElementById('step').value") == "1"
+    page.value("const s = document.getElementById('slider'); s.value = 0; s.oninput({target: s})")
+    assert page.value("document.getElementById('step').value") == "0"
+
+
+def test_a_turn_between_points_is_smooth() -> None:
+    """A parabola through six points, its top between two: within 0.03, where a monotone curve is cut off."""
+    x = np.linspace(-1.0, 1.0, 6)
+    drawn = smooth(x.tolist(), (1 - x**2).tolist())
+    assert np.abs(drawn[1] - (1 - drawn[0] ** 2)).max() < 0.03
+    assert drawn[1].max() == pytest.approx(1.0, abs=0.02)
+    assert PchipInterpolator(x, 1 - x**2)(np.linspace(-1, 1, 99)).max() == pytest.approx(0.96)
+
+
+def test_a_vibration_keeps_its_form() -> None:
+    """Four points a period, where straight lines would lose three tenths: within a twentieth."""
+    t = np.arange(17) * 0.25 + 0.125
+    drawn = splined(t.tolist(), np.sin(2 * np.pi * t).tolist(), t.tolist())
+    inner = drawn[:, 2 * FINE : -2 * FINE]
+    assert np.abs(inner[1] - np.sin(2 * np.pi * inner[0])).max() < 0.05
+    assert np.abs(np.interp(inner[0], t, np.sin(2 * np.pi * t)) - np.sin(2 * np.pi * inner[0])).max() > 0.29
