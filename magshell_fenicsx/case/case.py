@@ -21,7 +21,7 @@ from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.kinds import Bodies
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
@@ -138,7 +138,7 @@ class Case(WithParts):
             raise ValueError(
                 "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
             )
-        layers = self.magnetic.remanent.layers if self.magnetic else None
+        layers = self.remanent.layers if self.remanent else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
@@ -190,7 +190,8 @@ class Case(WithParts):
     def patches(self) -> dict[str, Iterable[str]]:
         """Keys with values by patch -> the names of these."""
         found = {f"natural.{key}": getattr(self.natural, key, None) for key in ("curvature", "stretch")}
-        found["magnetic.remanent.patches"] = self.magnetic.remanent.patches if self.magnetic else None
+        found["magnetic.remanent.patches"] = self.remanent and self.remanent.patches
+        found["magnetic.susceptibility"] = self.magnetic and self.magnetic.susceptibility
         return {key: patches for key, patches in found.items() if isinstance(patches, dict)}
 
     @model_validator(mode="after")
@@ -215,7 +216,7 @@ class Case(WithParts):
             return self
         if isinstance(self.thickness_factor, dict | GivenField):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
-        if self.magnetic and isinstance(self.magnetic.remanent.components, GivenField):
+        if self.remanent and isinstance(self.remanent.components, GivenField):
             raise ValueError("magnetic.remanent: of a solid a formula: a function on the mesh is that of a shell")
         if self.natural and self.natural.given:
             raise ValueError("natural: of a solid numbers and formulas: a function on the mesh is that of a shell")
@@ -301,6 +302,11 @@ class Case(WithParts):
         return strength(self.context)
 
     @property
+    def remanent(self) -> RemanentSection | None:
+        """What is magnetised for good."""
+        return self.magnetic and self.magnetic.remanent
+
+    @property
     def sources(self) -> Sequence[SourceSection]:
         """Of the applied field."""
         return (self.magnetic.applied.sources if self.magnetic else None) or []
@@ -321,7 +327,7 @@ class Case(WithParts):
         """The sections that read a file, by key; those below `shell` without that."""
         sections: dict[str, object] = {
             "shell": self.shell,
-            "magnetic.remanent": self.magnetic and self.magnetic.remanent,
+            "magnetic.remanent": self.remanent,
         }
         sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}

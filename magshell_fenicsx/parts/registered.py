@@ -43,6 +43,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "forces.loads.ForcesSeen",
     "supports.reacting.Moved",
     "magnetism.sources.field.SourcesSeen",
+    "magnetism.softness.SoftSeen",
     "bodies.standing.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`

@@ -193,7 +193,7 @@ class Scene:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
         field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
-        own = {*self.motions, *self.sources, *turns, *self.model.contacts}
+        own = {*self.motions, *self.sources, *turns, *self.model.contacts, *self.model.system.parameters}
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})

@@ -37,7 +37,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import by_patch, carried, cells_of
+from magshell_fenicsx.models.shell.patterns import carried, cells_of
 from magshell_fenicsx.models.shell.residual import FastResidual
 from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
@@ -111,11 +111,10 @@ class ShellModel(Thin):
     ) -> None:
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         for name in ("magnetic", "remanence"):
-            if (field := getattr(loads, name)) and field.patches:
+            if field := getattr(loads, name):
                 topology = midsurface.mesh.topology.index_map(2)
                 cells = topology.size_local + topology.num_ghosts
-                remanent = by_patch(field.patches, midsurface.patches, cells)
-                loads = replace(loads, **{name: replace(field, remanent=remanent)})
+                loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
         self.midsurface, self.material, self.degree = midsurface, material, degree
         self.load_size = {}
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1

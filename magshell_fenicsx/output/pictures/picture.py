@@ -157,6 +157,7 @@ LENGTH, BESIDE = 0.1, 0.014  # of the longest arrow, and from an arrow to its pl
 FIELDS = {
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$, as the shell carries it"),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
+    "J": ("C2", r"induced polarisation $\mu_0 M$"),
 }
 
 
@@ -180,7 +181,7 @@ def drawn_arrows(
     places, found = camera(r[seeds]), []
     drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in there}
     across = _across(next(iter(drawn.values()), places)) * BESIDE * extent * (len(there) > 1)
-    for name, side in zip(there, (1, -1), strict=False):
+    for name, side in zip(there, (1, -1, 0), strict=False):
         shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
         found.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
     return tuple(found)

@@ -121,15 +121,21 @@ class AppliedField:
         flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
         return np.concatenate(flat, axis=-1)
 
-    def slope(self, name: str, other: str = "") -> PointField:
-        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes."""
+    def slope(self, name: str, other: str = "", *, moved: bool = True) -> PointField:
+        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes.
+
+        Parameters
+        ----------
+        moved
+            Whether they are about the present places; else they are changes of the polynomials there.
+        """
         field = PointField(self._u.function_space.mesh, self._degree, SIZE)
-        field.follow(lambda: self._slopes(name, other), lambda: (self.polynomial.renew(),))
+        field.follow(lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),))
         return field
 
-    def _slopes(self, name: str, other: str) -> Array:
+    def _slopes(self, name: str, other: str, *, moved: bool) -> Array:
         values = np.zeros_like(self.polynomial.values)
-        values[..., :3] = self.polynomial.values[..., :3]
+        values[..., :3] = self.polynomial.values[..., :3] if moved else 0.0
         shape = values.shape[:2]
         for here in self._here:
             if name in here.driven.names and (not other or other in here.driven.names):
