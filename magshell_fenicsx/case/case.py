@@ -304,7 +304,7 @@ class Case(WithParts):
     @property
     def remanent(self) -> RemanentSection | None:
         """What is magnetised for good."""
-        return self.magnetic and self.magnetic.remanent
+        return self.magnetic.remanent if self.magnetic else None
 
     @property
     def sources(self) -> Sequence[SourceSection]:

@@ -79,8 +79,8 @@ class SoftSeen(Seen):
             return {}
         at, forms = sight.model.system.at(state), sight.model.observed
         J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(forms["induced volume"])
-        if sight.model.axisymmetric:
-            J[:2] = 0.0  # they turn with the meridian
+        if 1 not in sight.model.axes:  # of a meridian, with which they turn
+            J[:2] = 0.0
         if sight.mirror:
             J = (J + parity(sight, field, state, sight.mirror) * sight.mirror.reflection @ J) / 2
         return dict(zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True))
