@@ -83,6 +83,10 @@ class Evaluated:
         self.assembled(add)
         return self._system._summed(part)
 
+    def summed(self, part: NDArray[np.float64]) -> Vector:
+        """A vector at all nodes of this rank, ghosts too, summed over all ranks; zero at supports."""
+        return self._system._summed(part)
+
     def residual(self) -> Vector:
         """dPi/du; the terms that are not numbers are noted in the system's `strange`."""
         system = self._present

@@ -22,6 +22,7 @@ from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
@@ -83,6 +84,8 @@ class Case(WithParts):
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
+    sensors: Sensors = Field(default_factory=dict)
+    """Name -> point at which the magnetic field is read"""
     natural: NaturalSection | None = None
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)
@@ -116,7 +119,7 @@ class Case(WithParts):
     def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
-            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
+            parts = {key: data.get(key) for key in ("points", "mesh", "sensors", *PARTS)}
             written = listed(data.get("loading"))
             for key, load in listed(section.loading).items():
                 if load.measured and isinstance(written[key], dict):
@@ -132,12 +135,19 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:
-        if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
+        known = self.magnetic is None or self.magnetic.lambda_m is not None or self.magnetic.without_field
+        if not known and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if self.magnetic and self.magnetic.applied.sources and not self.shell.with_units:
             raise ValueError(
                 "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
             )
+        if self.sensors and self.magnetic is None:
+            raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
+        if self.sensors and "symmetry" in self.boundary.conditions().values():
+            raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
+        if self.magnetic and self.magnetic.without_field and not self.sensors:
+            raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
         layers = self.remanent.layers if self.remanent else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -200,7 +210,7 @@ class Case(WithParts):
         if isinstance(shell, MeshSurface):
             for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}):
                 raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
-        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None
+        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None and not self.magnetic.without_field
         if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
             raise ValueError(
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
@@ -218,6 +228,8 @@ class Case(WithParts):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         if self.remanent and isinstance(self.remanent.components, GivenField):
             raise ValueError("magnetic.remanent: of a solid a formula: a function on the mesh is that of a shell")
+        if self.sensors:
+            raise ValueError("sensors: read the field of a shell: take model: shell")
         if self.natural and self.natural.given:
             raise ValueError("natural: of a solid numbers and formulas: a function on the mesh is that of a shell")
         if self.magnetic and self.magnetic.energy != "full":

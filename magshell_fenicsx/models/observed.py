@@ -82,6 +82,11 @@ class Observed:
     thickness: fem.Function | None = None
     midsurface: Midsurface | None = None
 
+    @property
+    def mirrored_facets(self) -> Facets:
+        """The edges on the mirror plane of a half model; none of another."""
+        return np.empty(0, dtype=np.int32)
+
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
         self._volume = volume

@@ -44,6 +44,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "supports.reacting.Moved",
     "magnetism.sources.field.SourcesSeen",
     "magnetism.softness.SoftSeen",
+    "magnetism.own_field.SensorsSeen",
     "bodies.standing.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`

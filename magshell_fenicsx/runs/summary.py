@@ -15,6 +15,7 @@ from magshell_fenicsx.output.fields.modes import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.sections import Surface
@@ -199,6 +200,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "critical_field": result.critical_field,
         "barrier": result.barrier,
         "snaps": snaps(result.rows),
+        **{key: said for room in seen() for key, said in room.summary(scene.sight, result.last).items()},
         "frequencies": [
             {
                 "point": number,

@@ -277,6 +277,10 @@ class ShellModel(Thin):
             )
         )
 
+    @property
+    def mirrored_facets(self) -> NDArray[np.int32]:
+        return self._on_mirror
+
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement."""
         return self.midsurface.growth(self.V, deviations)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.natural.shape import Natural
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.magnetism.sensors import Sensor
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,10 @@ class Magnetisation:
         Whether the remanence moves with F, as in the paper, or with its rotation R.
     soft
         What is soft; None without. Alone, it leaves `remanent` zero.
+    tesla
+        What a remanence of length one is, in T; 1 if the case has no flux densities.
+    metres
+        R in m; 0 if the case has no lengths with units, or no flux densities.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -120,6 +127,8 @@ class Magnetisation:
     turns: tuple[Motion, ...] = ()
     given: GivenField | None = None
     soft: Soft | None = None
+    tesla: float = 1.0
+    metres: float = 0.0
 
     @property
     def uniform(self) -> bool:
@@ -221,6 +230,8 @@ class Loads:
         Amplitude -> imperfections that grow.
     remanence
         What is magnetised where no field is applied: it loads nothing, and is drawn.
+    sensors
+        Where its magnetic field is read.
     """
 
     pressure: bool = False
@@ -233,6 +244,7 @@ class Loads:
     contacts: tuple[Contact, ...] = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: Magnetisation | None = None
+    sensors: tuple["Sensor", ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -238,7 +238,7 @@ class MagneticSection(Ability):
             raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
         if self.model_fields_set == {"remanence"}:
             raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
-        if self.lambda_m is None and None in densities:
+        if self.lambda_m is None and None in densities and not self.without_field:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
@@ -247,6 +247,12 @@ class MagneticSection(Ability):
                 "the approximate energies are of uniform fields; gradient, components and sources need energy: full"
             )
         return self
+
+    @property
+    def without_field(self) -> bool:
+        """Whether the remanence is alone: nothing says how strong a field is."""
+        given = self.model_fields_set
+        return self.remanent is not None and self.lambda_m is None and "remanent" in given and "applied" not in given
 
     def _one_field(self) -> None:
         """Of a shell that is soft alone."""
@@ -261,6 +267,8 @@ class MagneticSection(Ability):
         """lambda_m = |Br||Ba|/(mu_0 E); of a shell that is soft alone |Ba|/sqrt(mu_0 E)."""
         if self.lambda_m is not None:
             return self.lambda_m
+        if self.without_field:
+            return 0.0
         assert self.applied.reference is not None
         assert youngs_modulus
         return self.applied.reference / self.tesla(youngs_modulus)
@@ -275,7 +283,7 @@ class MagneticSection(Ability):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
 
-        return leaves(context, outline) if strength(context) else []
+        return leaves(context, outline) if strength(context) or context.sections.get("sensors") else []
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
@@ -294,6 +302,9 @@ class MagneticSection(Ability):
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
         from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
 
+        from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_sensors
+
+        refuse_unfit_sensors(context)
         lambda_m = strength(context)
         largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell
         if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:
@@ -357,7 +368,7 @@ class MagneticSection(Ability):
 
     def units(self, context: Context, units: Given) -> Given:
         """The flux density, or the strength of the sources, of lambda_m = 1."""
-        if isnan(units.E) or not (self.remanent is None or self.remanent.flux_density):
+        if isnan(units.E) or self.without_field or not (self.remanent is None or self.remanent.flux_density):
             return units
         if self.applied.beside:
             return replace(units, applied=1e3 * self.tesla(units.E))

@@ -1,6 +1,7 @@
 """The field section in the model's frame."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.sensors import sensors, units
 from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
@@ -55,6 +57,7 @@ def magnetisation(
     """
     section, gradient = magnetic.remanent or RemanentSection.model_construct(), magnetic.applied.gradient
     known, driven = in_space(context, turn)
+    own = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
     for direction in () if known else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
@@ -83,6 +86,8 @@ def magnetisation(
         turns(context, turn),
         section.components if isinstance(section.components, GivenField) else None,
         soft(context, turn, within),
+        own if np.isfinite(own) else 1.0,
+        context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
     )
 
 
@@ -113,7 +118,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     magnetic = context.of(MagneticSection)
     assert magnetic
     known = magnetic.applied.components if magnetic.applied.beside else None
-    alone = known or not magnetic.applied.beside
+    alone = known or not magnetic.applied.beside or not strength(context)
     magnetised = magnetic.remanent.directions() if magnetic.remanent else []
     vectors = [d.vector() for d in (*magnetised, *([] if alone else [magnetic.applied]))]
     whole = turns(context)  # then the rotation is a part of the field at each place
@@ -175,21 +180,22 @@ def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
-def adds(context: Context, modelled: Modelled) -> dict[str, Magnetisation]:
+def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it is."""
     magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    read = {"sensors": sensors(context, turn)}
     if FieldSection.amplitude in driven:
         to = [step.to for step in _rotations(context)]
-        return {"magnetic": magnetisation(magnetic, context, turn, within, to)}
+        return {"magnetic": magnetisation(magnetic, context, turn, within, to), **read}
     if magnetic.remanent is None:
-        return {}
+        return read
     (part,) = leaves(context, modelled.outline)
     shown = part.askew is None or not modelled.axisymmetric
     if not shown or (modelled.plane and not part.mirrors(modelled.plane)):
-        return {}
-    return {"remanence": magnetisation(magnetic, context, turn, within)}
+        return read
+    return {"remanence": magnetisation(magnetic, context, turn, within), **read}
 
 
 def _rotations(context: Context) -> list[RotationSection]:

@@ -33,6 +33,7 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.motion.mass import mass_along
+from magshell_fenicsx.parts.seen import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
@@ -131,6 +132,8 @@ class Adjoint:
         Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
     left
         Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
+    slope
+        What J is of a room, with its own derivatives by a field.
     """
 
     scene: Scene
@@ -143,6 +146,7 @@ class Adjoint:
     free: str = ""
     scale: str = ""
     left: frozenset[str] = frozenset()
+    slope: Slope | None = None
 
     @property
     def size(self) -> float:
@@ -246,7 +250,7 @@ def adjoint(
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     found = functional(scene, state, column)
     held = held_at(scene, record, state, hold)
-    if free := [name for name in found.by_mu if name not in held]:
+    if free := [name for name in found.by_mu if name not in held and not found.slope]:
         raise CaseError(f"{free[0]}: is a load here, which no parameter changes: hold its conjugate")
     w, rows = solved(scene, state, found, held)
     by_itself = None if found.energy else lambda there, at: functional(there, at, column).value
@@ -255,7 +259,16 @@ def adjoint(
         by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
         w = w + found.reaction
     here = Place(state, w, rows, found.energy, found.potentials)
-    made = Adjoint(scene, [here], found.by_mu, by_itself, value=found.value, gas=with_gas(held), scale=scale)
+    made = Adjoint(
+        scene,
+        [here],
+        found.by_mu,
+        by_itself,
+        value=found.value,
+        gas=with_gas(held),
+        scale=scale,
+        slope=found.slope,
+    )
     return with_begins(made, record, begins) if hold is None else made
 
 
