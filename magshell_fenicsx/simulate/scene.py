@@ -321,8 +321,8 @@ class Scene:
         problem = self.problem
         return Sight(self.model, problem.length, problem.modulus, problem.mirror, problem.azimuth, problem.reactions)
 
-    def to_magpylib(self, record: "Record", parts: int = 4) -> Any:
-        """The magnetised shell of a record as a collection of charged triangles of magpylib; collective.
+    def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
+        """The magnetised shell of a record as a source of magpylib, of charged triangles; collective.
 
         In m and T; of a case without units over R and |Br|. Each side of a cell is divided into `parts`.
 

@@ -300,9 +300,8 @@ class MagneticSection(Ability):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
-        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
-
         from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_sensors
+        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
 
         refuse_unfit_sensors(context)
         lambda_m = strength(context)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
@@ -14,25 +13,15 @@ from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.shell.parameters import ACROSS, Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
-from magshell_fenicsx.parts.magnetism.charges import (
-    Faces,
-    Family,
-    Nodal,
-    Shape,
-    Sides,
-    TooNear,
-    field,
-    gradient,
-    moment,
-    triangles,
-)
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.magnetism.softness import parity
 from magshell_fenicsx.parts.seen import Seen, Sight, Slope
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.observed import Observed
+    pass
 
 Array = NDArray[np.float64]
 JUMP = 1e-6  # of the remanence between two cells, relative
@@ -73,15 +62,19 @@ class OwnField:
         self._edges = self._sides()
         self._sign = self._parity(pattern)
 
-    def families(self, mu: Mapping[str, float]) -> tuple[Shape, list[Family]]:
-        """The shell's shape and its charges at the displacement that the system has."""
+    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
+        """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
         shape = self._shape(mu)
-        cells, edges = self._edges
-        return shape, [Faces(shape, np.arange(self._owned)), *([Sides(shape, cells, edges)] if len(cells) else [])]
+        cells, edges = self._sides(every=True) if may else self._edges
+        faces = Faces(shape, np.arange(self._owned), may=may)
+        return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
 
     def B(self, families: Sequence[Family], mu: Mapping[str, float], x: Array) -> Array:
         """The field (3,) at a place, of a remanence of length one; nan in the shell; collective."""
         try:
+            images = [x, *([self._sight.mirror.image(x)] if self._sight.mirror else [])]
+            if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
+                raise TooNear
             found = field(families, x[None])[0]
             if mirror := self._sight.mirror:
                 sign = self._signed(mu)
@@ -90,12 +83,17 @@ class OwnField:
             found = np.full(3, np.nan)
         return np.asarray(self._model.system.comm.allreduce(found))
 
-    def slope(self, shape: Shape, families: Sequence[Family], mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
+    def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
         """The derivatives of e . B at this rank's nodes, by the displacement and by the remanence."""
-        into = Nodal(np.zeros((len(shape.u), shape.u.shape[1], shape.u.shape[2])), np.zeros_like(shape.remanence))
-        gradient(families, x, e, into)
-        if mirror := self._sight.mirror:
-            gradient(families, mirror.image(x), self._signed(mu) * mirror.reflection @ e, into)
+        parts = list[Nodal]()
+        for may in (False, True) if self._plain else (True,):  # charges that are zero have derivatives
+            shape, families = self.families(mu, may=may)
+            into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
+            gradient(families, x, e, into)
+            if mirror := self._sight.mirror:
+                gradient(families, mirror.image(x), self._signed(mu) * mirror.reflection @ e, into)
+            parts.append(into)
+        into = Nodal(parts[0].by_u, parts[-1].by_remanence)
         return into if self._plain else self._to_material(into, mu)
 
     def moment(self, families: Sequence[Family], mu: Mapping[str, float]) -> Array:
@@ -185,8 +183,11 @@ class OwnField:
         self.Br.x.array[:] = known
         return Nodal(by_u, by_B)
 
-    def _sides(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Own cells and their local edges at the boundary, and where the remanence jumps; not on a mirror plane."""
+    def _sides(self, *, every: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Own cells and their local edges at the boundary, and where the remanence jumps, or `every` one.
+
+        None on a mirror plane.
+        """
         V = self._model.r0.function_space
         mesh = V.mesh
         topology, dim = mesh.topology, self._dim
@@ -210,7 +211,7 @@ class OwnField:
                     continue
                 other = next(int(c) for c in to_cells.links(facet) if c != cell)
                 there = int(np.flatnonzero(at[other] == facet)[0])
-                if not self._plain or np.abs(ends[cell, local] - ends[other, there]).max() > JUMP * largest:
+                if every or not self._plain or np.abs(ends[cell, local] - ends[other, there]).max() > JUMP * largest:
                     cells.append(cell)
                     edges.append(local)
         found = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
@@ -262,9 +263,9 @@ class SensorsSeen(Seen):
     def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
         from scipy.spatial import cKDTree
 
-        if not (loads.sensors and surface.read):
+        if not loads.sensors or surface.nodes.shape[1] < 3:  # of a chart `sensors.depth` knows
             return
-        corners = surface.embedding(surface.points)[surface.cells[:, :3]]
+        corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
         spread = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
         near = cKDTree(np.einsum("mk,nki->nmi", spread, corners).reshape(-1, 3))
         for each in loads.sensors:
@@ -303,9 +304,8 @@ class SensorsSeen(Seen):
         at, nodes = system.at(state), sight.model.r0.function_space.dofmap.list
 
         def derived() -> tuple[Array, Array]:
-            shape, families = own.families(state.mu)
-            into, part = own.slope(shape, families, state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
-            size = shape.u.shape[2]
+            into, part = own.slope(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
+            size = into.by_u.shape[2]
             np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
             return part, into.by_remanence
 
@@ -317,7 +317,7 @@ class SensorsSeen(Seen):
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
                 size = STEP * (abs(value) or 1.0)
                 moved = ((way, State(state.u, {**state.mu, name: value + way * size})) for way, _ in CENTRAL)
-                values = dict((way, self._readings(sight, there, [sensor])[0][i]) for way, there in moved)
+                values = {way: self._readings(sight, there, [sensor])[0][i] for way, there in moved}
                 by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
         value = float(self._readings(sight, state, [sensor])[0][i])
         return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
@@ -342,8 +342,8 @@ class SensorsSeen(Seen):
         return [B @ Q for B in found]
 
 
-def to_magpylib(sight: Sight, state: State, parts: int = 4) -> Any:
-    """The shell of a state as charged triangles of magpylib, in m and T; of a case without units over R and |Br|.
+def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
+    """The shell of a state as a source of magpylib, of charged triangles, in m and T; without units over R and |Br|.
 
     Parameters
     ----------
@@ -371,10 +371,19 @@ def to_magpylib(sight: Sight, state: State, parts: int = 4) -> Any:
             found += [(mirror.image(x), sign * q) for x, q in found]
         return found
 
-    found = [each for rank in sight.model.system.comm.allgather(sight.model.system.at(state).of(present)) for each in rank]
+    system = sight.model.system
+    found = [each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank]
     corners, charges = (np.concatenate([each[i] for each in found]) for i in range(2))
-    collection = made.Collection()
-    for x, q in zip(corners @ Q, charges, strict=True):
-        m = np.cross(x[1] - x[0], x[2] - x[0]) / 2
-        collection.add(made.misc.Triangle(vertices=R * x, polarization=of.tesla * q * m / (m @ m)))
-    return collection
+    corners = R * corners @ Q
+    m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    J = (of.tesla * R**2 * charges / np.sum(m * m, axis=-1))[:, None] * m
+
+    def B(kind: str, observers: Array) -> Array:
+        """Of all triangles; magpylib asks for B or H."""
+        total = np.zeros((len(observers), 3))
+        for i, x in enumerate(observers):
+            seen = np.broadcast_to(x, (len(J), 3))
+            total[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
+        return total / MU_0 if kind == "H" else total
+
+    return made.misc.CustomSource(field_func=lambda field, observers: B(field, observers))
