@@ -310,7 +310,8 @@ def moment(families: Sequence[Family]) -> Array:
 def square(n: int) -> tuple[Array, Array]:
     """Gauss's rule on the unit square."""
     x, w = gauss(n)
-    return np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2), np.outer(w, w).ravel()
+    points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(points), np.asarray(np.outer(w, w).ravel())
 
 
 def _chunks(boxes: Boxes, points: int) -> Iterator[Boxes]:

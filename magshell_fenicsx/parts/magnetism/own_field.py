@@ -200,7 +200,7 @@ class OwnField:
         largest = np.abs(values).max(initial=0.0) or 1.0
         ends = self._ends(len(at), values)
         cells, edges = list[int](), list[int]()
-        cut = set(self._model.mirrored_facets.tolist())
+        cut = {int(facet) for facet in self._model.mirrored_facets}
         for cell in range(self._owned):
             for local, facet in enumerate(at[cell]):
                 if facet in cut:
@@ -384,6 +384,6 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
         for i, x in enumerate(observers):
             seen = np.broadcast_to(x, (len(J), 3))
             total[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
-        return total / MU_0 if kind == "H" else total
+        return np.asarray(total / MU_0 if kind == "H" else total)
 
     return made.misc.CustomSource(field_func=lambda field, observers: B(field, observers))

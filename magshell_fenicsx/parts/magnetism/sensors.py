@@ -18,7 +18,6 @@ from magshell_fenicsx.shape.sections import MeshSurface, Surface
 from magshell_fenicsx.shape.shell import ShellSection
 
 Array = NDArray[np.float64]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 STEPS, DIFFERENCE = 8, 1e-6  # of Gauss's and Newton's method for the nearest place of a surface
 
 
@@ -34,7 +33,7 @@ class SensorSection(Section):
     """What it reads: the field of the magnetised shell alone, or with the applied one"""
 
 
-Sensors = Annotated[dict[Name, SensorSection], Field(max_length=1000)]
+Sensors = Annotated[dict[str, SensorSection], Field(max_length=1000)]
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,8 @@ def refuse_unfit_sensors(context: Context) -> None:
     """
     given: dict[str, SensorSection] = context.sections.get("sensors") or {}
     for name, each in given.items():
+        if not name.isidentifier():
+            raise CaseError(f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns")
         if each.field == "total" and not np.isfinite(units(context)[1]):
             raise CaseError(
                 f"sensors.{name}.field: total: lambda_m does not say how strong the applied field is: give "

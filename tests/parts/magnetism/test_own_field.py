@@ -258,7 +258,7 @@ def test_export_to_magpylib() -> None:
         ({"hall": {"position": [0, 0, 20 * MM]}}, FIELD, "sensors.hall.position: .* is in the shell"),
         ({"hall": {"position": [0, 0, 1], "field": "total"}}, {"lambda_m": 1e-3}, "sensors.hall.field: total"),
         ({"hall": {"position": [0, 0]}}, FIELD, "sensors.hall.position"),
-        ({"2nd": {"position": [0, 0, 1]}}, FIELD, "sensors"),
+        ({"2nd": {"position": [0, 0, 1]}}, FIELD, "sensors: 2nd: a name is made of"),
         ({"hall": {"position": [0, 0, 1]}}, None, "sensors: need magnetic"),
         ({}, {"remanent": {"flux_density": "1 T"}}, "give lambda_m, or"),
     ],
