@@ -270,7 +270,9 @@ class SensorsSeen(Seen):
         near = cKDTree(np.einsum("mk,nki->nmi", spread, corners).reshape(-1, 3))
         for each in loads.sensors:
             if near.query(each.place)[0] < each.half:
-                raise CaseError(f"sensors.{each.name}.position: is in the shell: place it outside")
+                raise CaseError(
+                    f"sensors.{each.name}.position: is in the shell, within half its thickness of it: place it outside"
+                )
 
     def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
         return tuple(column for each in loads.sensors for column in each.columns)

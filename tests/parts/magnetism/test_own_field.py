@@ -8,6 +8,8 @@ import basix
 import magpylib
 import numpy as np
 import pytest
+from conftest import CASES
+from scipy.integrate import quad
 
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
@@ -15,7 +17,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, field, moment
 from magshell_fenicsx.parts.registered import seen
-from magshell_fenicsx.public import follow
+from magshell_fenicsx.public import follow, run
 
 MM = 1e-3
 LAGRANGE = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
@@ -63,6 +65,27 @@ def test_a_closed_sphere(made: Any) -> None:
     expected = dipole(x, m)
     error = np.linalg.norm(field(families, x) - expected, axis=1) / np.linalg.norm(expected, axis=1)
     assert (error < 1e-6).all(), error
+
+
+def test_the_case_hall_sensor() -> None:
+    """The dome's field on its axis before the ball comes, by SciPy: charges of both faces and of the rim; 1e-6."""
+    R, h, z, edge = 14.142135623730951 * MM, 0.7 * MM, 7 * MM, np.pi / 4
+
+    def face(r: float) -> float:
+        def rate(a: float) -> float:
+            d = np.hypot(r * np.sin(a), z - r * np.cos(a))
+            return float(np.cos(a) * (z - r * np.cos(a)) / d**3 * r**2 * np.sin(a) / 2)
+
+        return float(quad(rate, 0, edge, epsabs=0, epsrel=1e-10)[0])
+
+    def rim(r: float) -> float:
+        d = np.hypot(r * np.sin(edge), z - r * np.cos(edge))
+        return float(-np.sin(edge) * (z - r * np.cos(edge)) / d**3 * r * np.sin(edge) / 2)
+
+    expected = 0.08 * (face(R + h / 2) - face(R - h / 2) + quad(rim, R - h / 2, R + h / 2, epsrel=1e-10)[0])
+    first, *_, last = run(Case.load(CASES / "hall_sensor.yaml", ["loading.points=2"])).rows
+    assert first["hall_Bz"] == pytest.approx(expected, rel=1e-6)
+    assert last["hall_Bz"] < 0.9 * first["hall_Bz"]
 
 
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa"}
