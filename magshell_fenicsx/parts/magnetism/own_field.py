@@ -380,12 +380,12 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
     m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     J = (of.tesla * R**2 * charges / np.sum(m * m, axis=-1))[:, None] * m
 
-    def B(kind: str, observers: Array) -> Array:
+    def total(field: str, observers: Array) -> Array:
         """Of all triangles; magpylib asks for B or H."""
-        total = np.zeros((len(observers), 3))
+        B = np.zeros((len(observers), 3))
         for i, x in enumerate(observers):
             seen = np.broadcast_to(x, (len(J), 3))
-            total[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
-        return np.asarray(total / MU_0 if kind == "H" else total)
+            B[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
+        return np.asarray(B / MU_0 if field == "H" else B)
 
-    return made.misc.CustomSource(field_func=lambda field, observers: B(field, observers))
+    return made.misc.CustomSource(field_func=total)

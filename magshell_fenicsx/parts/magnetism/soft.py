@@ -9,7 +9,7 @@ remanence has sqrt(mu0 E) in place of |Br|. The field of other places of the she
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 TERM = "soft magnetism"
-LARGEST = 1e6  # of a susceptibility
 
 
 @dataclass(frozen=True)
@@ -151,9 +150,3 @@ def across(H: Expr, n0: Expr) -> Expr:
     cofactor = ufl.as_tensor([ufl.cross(f[1], f[2]), ufl.cross(f[2], f[0]), ufl.cross(f[0], f[1])]).T
     n = ufl.dot(cofactor, n0)
     return n / ufl.sqrt(ufl.dot(n, n))
-
-
-def soft_of(field: Any) -> Soft | None:
-    """What is soft of a magnetisation; None of none."""
-    found: Soft | None = getattr(field, "soft", None)
-    return found
