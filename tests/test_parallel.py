@@ -46,6 +46,14 @@ SCENES |= {
         ],
     ),
 }
+SOFT = "magnetic={susceptibility: 2 + x, remanent: {polar: 90, flux_density: 3 mT}, applied: {sources: [%s]}}"
+NEAR = "{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.3 T, position: [40 mm, 0, -60 mm]}"
+SCENES |= {
+    "half shell, soft beside a magnet": (
+        "magnet_strip.yaml",
+        [*COARSER, "--set=mesh.degree=2", f"--set={SOFT % NEAR}", "--set=loading={kind: field, points: 2}"],
+    ),
+}
 ROOF = ["--set=loading.control=load", "--set=loading.factor=0.3", "--set=loading.points=2"]
 SCENES |= {
     "symmetry planes, a force at a point": ("benchmarks/hinged_roof_12.7.yaml", ROOF),

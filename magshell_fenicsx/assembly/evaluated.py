@@ -83,6 +83,10 @@ class Evaluated:
         self.assembled(add)
         return self._system._summed(part)
 
+    def summed(self, part: NDArray[np.float64]) -> Vector:
+        """A vector at all nodes of this rank, ghosts too, summed over all ranks; zero at supports."""
+        return self._system._summed(part)
+
     def residual(self) -> Vector:
         """dPi/du; the terms that are not numbers are noted in the system's `strange`."""
         system = self._present
@@ -138,11 +142,10 @@ class Evaluated:
             own = float(system._gradient(system._factors(mu)) @ system.moving.rate(mu, name))
             for edge, A in system.moving.turning(mu, name):
                 own += float(system._gradient({edge: 1.0}) @ system.moving.along(A, system.u.x.array))
-        elif name in system.parameters:
-            slopes = system.parameters[name].slopes
-            own = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
         else:
-            own = sum(t.energy() for t in system.terms if t.amplitude == name)
+            slopes = system.parameters[name].slopes if name in system.parameters else ()
+            own = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
+            own += sum(t.energy() for t in system.terms if t.amplitude == name)
         return float(system.comm.allreduce(own)) + system._of_lids(mu, name)
 
     def curvature(self, name: str, other: str) -> float:
@@ -154,12 +157,13 @@ class Evaluated:
             return float(system.comm.allreduce(own)) + system._of_lids(mu, name, other)
         if name not in system.parameters:
             name, other = other, name
-        parameter = system.parameters[name]
+        parameter, own = system.parameters[name], 0.0
+        own += sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         if other in system.parameters:
-            bends = parameter.bends(system.parameters[other].constant)
-            own = sum(factor_of(bend.amplitude, mu) * bend.energy() for bend in bends)
-        else:
-            own = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
+            second = system.parameters[other]
+            bends = parameter.bends(second.constant)
+            own += sum(factor_of(bend.amplitude, mu) * bend.energy() for bend in bends)
+            own += sum(slope.energy() for slope in second.slopes if slope.amplitude == name)
         return float(system.comm.allreduce(own))
 
     def tangent(self, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None) -> PETSc.Mat | Skewed:

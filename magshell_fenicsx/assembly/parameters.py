@@ -54,7 +54,8 @@ class Parameter:
     slopes
         dPi_i/dp as terms with the amplitudes mu_i.
     twice
-        Makes the derivatives of the slopes by another parameter in the terms, or by p itself.
+        Makes the derivatives of the slopes by another parameter in the terms, or by p itself. Where q is no constant
+        but has a method `bends`, that makes them.
     """
 
     constant: Settable
@@ -65,7 +66,7 @@ class Parameter:
     def bends(self, q: Any) -> Sequence[Derivative]:
         """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
         if q not in self._bends:
-            self._bends[q] = q.bends(self.constant) if isinstance(q, GrowingValue) else self.twice(q)
+            self._bends[q] = q.bends(self.constant) if hasattr(q, "bends") else self.twice(q)
         return self._bends[q]
 
 

@@ -231,9 +231,13 @@ class FiniteElementSystem:
         if self.moving and name in self.moving.names:
             return self._times(self.moving.rate(mu, name), self._factors(mu)) + self._turning_column(mu, name)
         if name in self.parameters:
-            slopes = self.parameters[name].slopes
-            return self._gradient({}, [(factor_of(slope.amplitude, mu), slope) for slope in slopes])
-        return self._gradient({t.name: 1.0 for t in self.terms if t.amplitude == name})
+            slopes = [(factor_of(slope.amplitude, mu), slope) for slope in self.parameters[name].slopes]
+            return self._gradient(self._multiplied(name), slopes)
+        return self._gradient(self._multiplied(name))
+
+    def _multiplied(self, name: str) -> dict[str, float]:
+        """The terms that an amplitude multiplies."""
+        return {t.name: 1.0 for t in self.terms if t.amplitude == name}
 
     def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
         """The part of it that normals of edges make, which turn with the motion."""

@@ -21,7 +21,8 @@ from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.kinds import Bodies
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
@@ -88,6 +89,8 @@ class Case(WithParts):
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
+    sensors: Sensors = Field(default_factory=dict)
+    """Name -> point at which the magnetic field is read"""
     natural: NaturalSection | None = None
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)
@@ -121,7 +124,7 @@ class Case(WithParts):
     def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
-            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
+            parts = {key: data.get(key) for key in ("points", "mesh", "sensors", *PARTS)}
             written = listed(data.get("loading"))
             for key, load in listed(section.loading).items():
                 if load.measured and isinstance(written[key], dict):
@@ -137,13 +140,20 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:
-        if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
+        known = self.magnetic is None or self.magnetic.lambda_m is not None or self.magnetic.without_field
+        if not known and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if self.magnetic and self.magnetic.applied.sources and not self.shell.with_units:
             raise ValueError(
                 "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
             )
-        layers = self.magnetic.remanent.layers if self.magnetic else None
+        if self.sensors and self.magnetic is None:
+            raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
+        if self.sensors and "symmetry" in self.boundary.conditions().values():
+            raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
+        if self.magnetic and self.magnetic.without_field and not self.sensors:
+            raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
+        layers = self.remanent.layers if self.remanent else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
@@ -195,7 +205,8 @@ class Case(WithParts):
     def patches(self) -> dict[str, Iterable[str]]:
         """Keys with values by patch -> the names of these."""
         found = {f"natural.{key}": getattr(self.natural, key, None) for key in ("curvature", "stretch")}
-        found["magnetic.remanent.patches"] = self.magnetic.remanent.patches if self.magnetic else None
+        found["magnetic.remanent.patches"] = self.remanent and self.remanent.patches
+        found["magnetic.susceptibility"] = self.magnetic and self.magnetic.susceptibility
         return {key: patches for key, patches in found.items() if isinstance(patches, dict)}
 
     @model_validator(mode="after")
@@ -204,7 +215,7 @@ class Case(WithParts):
         if isinstance(shell, MeshSurface):
             for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}):
                 raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
-        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None
+        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None and not self.magnetic.without_field
         if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
             raise ValueError(
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
@@ -220,8 +231,10 @@ class Case(WithParts):
             return self
         if isinstance(self.thickness_factor, dict | GivenField):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
-        if self.magnetic and isinstance(self.magnetic.remanent.components, GivenField):
+        if self.remanent and isinstance(self.remanent.components, GivenField):
             raise ValueError("magnetic.remanent: of a solid a formula: a function on the mesh is that of a shell")
+        if self.sensors:
+            raise ValueError("sensors: read the field of a shell: take model: shell")
         if self.natural and self.natural.given:
             raise ValueError("natural: of a solid numbers and formulas: a function on the mesh is that of a shell")
         if self.magnetic and self.magnetic.energy != "full":
@@ -306,6 +319,11 @@ class Case(WithParts):
         return strength(self.context)
 
     @property
+    def remanent(self) -> RemanentSection | None:
+        """What is magnetised for good."""
+        return self.magnetic.remanent if self.magnetic else None
+
+    @property
     def sources(self) -> Sequence[SourceSection]:
         """Of the applied field."""
         return (self.magnetic.applied.sources if self.magnetic else None) or []
@@ -326,7 +344,7 @@ class Case(WithParts):
         """The sections that read a file, by key; those below `shell` without that."""
         sections: dict[str, object] = {
             "shell": self.shell,
-            "magnetic.remanent": self.magnetic and self.magnetic.remanent,
+            "magnetic.remanent": self.remanent,
         }
         sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}

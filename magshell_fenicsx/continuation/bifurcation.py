@@ -91,7 +91,8 @@ def find_bifurcation(
 def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifurcation:
     system, state, before = newton.system, guess, newton.factorisation.count
     b, steps, changes = phi, list[float](), list[float]()
-    while not _done(steps):
+    free = name in system.coordinates  # the tangent is then not linear in the amplitude
+    while not (_done(steps) and (not free or _kept(changes, state.mu[name]))):
         if len(steps) == MOST_ITERATIONS:
             raise BifurcationLost
         tangent = AugmentedTangent(newton, state, b)
@@ -159,6 +160,12 @@ def _done(sizes: Sequence[float]) -> bool:
     """Whether the last step is below the tolerance, or as small as rounding allows."""
     stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING
     return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)
+
+
+def _kept(changes: Sequence[float], mu: float) -> bool:
+    """Whether the last change of the amplitude is below the tolerance, or as small as rounding allows."""
+    stalled = len(changes) > 1 and changes[-1] > changes[-2] / 2 and changes[-1] <= ROUNDING * abs(mu)
+    return stalled or changes[-1] <= TOLERANCE * abs(mu)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Observed:
     fields
         The applied field, where it is known by its values.
     observed
-        Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
+        Column -> the form that a term observes, see `OwnTerm.observed`; and what a field induces. Of the modelled part.
     contacts
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
     growing
@@ -73,13 +73,18 @@ class Observed:
     load_size: dict[str, float]
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
-    observed: Mapping[str, fem.Form]
+    observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None
     axes: ClassVar[list[int]] = [0, 1, 2]
     thickness: fem.Function | None = None
     midsurface: Midsurface | None = None
+
+    @property
+    def mirrored_facets(self) -> Facets:
+        """The edges on the mirror plane of a half model; none of another."""
+        return np.empty(0, dtype=np.int32)
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -168,6 +173,8 @@ class Thin(Observed):
         factory, own = self.factory, [(term, edges[term.on] if term.on else None) for term in self.loads.own]
         energies = [factory.own(term, facets) for term, facets in own]
         self.observed = self.kernels.compile_all(factory.observed(term, facets) for term, facets in own)
+        if self.loads.magnetic:
+            self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}
         for contact in self.loads.contacts:
             pressed, pressing, integrals = factory.contact(contact)

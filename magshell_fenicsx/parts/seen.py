@@ -1,18 +1,25 @@
 """What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate to amplitudes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
 from magshell_fenicsx.quantities.registry import take
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.continuation.system import State
+    from dolfinx import fem
+
+    from magshell_fenicsx.continuation.system import State, Vector
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.models.observed import Observed
     from magshell_fenicsx.models.shell.parameters import Loads
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,25 @@ class Sight:
     def potential(self, state: "State", name: str) -> float:
         """Pi_i(u) of an amplitude, of what is modelled."""
         return self.model.system.potential(state.u, state.mu, name)
+
+
+@dataclass(frozen=True)
+class Slope:
+    """A column of a state with its derivatives.
+
+    Attributes
+    ----------
+    by_u, by_mu
+        By the displacement, zero at supports, and by amplitudes where it contains them itself.
+    field, by_field
+        A field of the terms, and the column's own derivatives by its values (cells, nodes, components) in own cells.
+    """
+
+    value: float
+    by_u: "Vector"
+    by_mu: Mapping[str, float]
+    field: "fem.Function | None" = None
+    by_field: "Array | None" = None
 
 
 class Seen:
@@ -113,6 +139,18 @@ class Seen:
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Column -> value."""
+        return {}
+
+    def differentiable(self, loads: "Loads") -> Sequence[str]:
+        """Its columns that have a `slope`."""
+        return ()
+
+    def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
+        """A column with its derivatives; None if it is another room's; collective."""
+        return None
+
+    def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
+        """What summary.json says of the end of a path; collective."""
         return {}
 
     def conjugate_unit(self, sight: Sight, name: str) -> float | None:

@@ -59,7 +59,8 @@ def layers(context: Context) -> list[float]:
     Magnetised layers end where elements do, and so does the inner half then: nodes lie in the middle.
     """
     count, magnetic = _section(context).layers, context.of(MagneticSection)
-    magnetised = (magnetic and magnetic.remanent.layers) or []
+    remanent = magnetic and magnetic.remanent
+    magnetised = (remanent and remanent.layers) or []
     if not magnetised:
         return [n / count for n in range(count + 1)]
     tops = [sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)]

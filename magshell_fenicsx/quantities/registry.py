@@ -56,7 +56,8 @@ OF_EVERY_RUN = (
     Quantity(
         "lambda_m",
         "field",
-        "|Br||Ba|/(μ0 E), with the sign of the case; in SI the applied flux density.",
+        "|Br||Ba|/(μ0 E), of a shell that is soft alone |Ba|/√(μ0 E), with the sign of the case; in SI the applied "
+        "flux density.",
         "load",
         "λ_m",
         (FIELD, STRENGTH),

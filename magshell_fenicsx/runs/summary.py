@@ -15,6 +15,7 @@ from magshell_fenicsx.output.fields.modes import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.sections import ShellSection, Surface
@@ -200,6 +201,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "barrier": result.barrier,
         "snaps": snapped,
         **({"snap_time_ms": 1e3 * snapped[0]["time"] * sizes.size("time")} if snapped and sizes.unit("time") else {}),
+        **{key: said for room in SEEN for key, said in room.summary(scene.sight, result.last).items()},
         "frequencies": [
             {
                 "point": number,

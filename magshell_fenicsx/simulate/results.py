@@ -17,6 +17,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.seen import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
@@ -42,6 +43,8 @@ class Functional:
         c: J contains c Pi.
     reaction
         e at supports: J is e . R of the residual of all nodes.
+    slope
+        What J is of a room, with its derivatives by a field; then J is no amplitude itself, whatever `by_mu` is.
     """
 
     value: float
@@ -50,6 +53,7 @@ class Functional:
     potentials: Mapping[str, float] = field(default_factory=dict)
     energy: float = 0.0
     reaction: Vector | None = None
+    slope: Slope | None = None
 
 
 def functional(scene: Scene, state: State, of: str | Target) -> Functional:
@@ -82,6 +86,9 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
+    for room in SEEN:
+        if slope := room.slope(scene.sight, state, of):
+            return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
     name = next((name for name in state.mu if of in (name, amplitude(name).column)), "")
     if name:
         return Functional(state.mu[name], still, {name: 1.0})
@@ -91,9 +98,10 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
 def differentiable(scene: Scene, state: State) -> list[str]:
     """The columns of path.csv that `functional` takes, and those of them in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
+    rooms = (column for room in SEEN for column in room.differentiable(scene.problem.loads))
     amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.history)
     found = dict.fromkeys(
-        ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *amplitudes)
+        ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *rooms, *amplitudes)
     )
     return [*found, *scene.sizes.columns(found)]
 

@@ -5,6 +5,7 @@ from collections import defaultdict
 from dataclasses import replace
 from functools import cached_property
 from math import copysign, nan
+from typing import TYPE_CHECKING, Any
 from warnings import warn
 
 import numpy as np
@@ -41,6 +42,9 @@ from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
 
@@ -193,7 +197,7 @@ class Scene:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
         field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
-        own = {*self.motions, *self.sources, *turns, *self.model.contacts}
+        own = {*self.motions, *self.sources, *turns, *self.model.contacts, *self.model.system.parameters}
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
@@ -316,6 +320,20 @@ class Scene:
         """What rooms of parts see of it."""
         problem = self.problem
         return Sight(self.model, problem.length, problem.modulus, problem.mirror, problem.azimuth, problem.reactions)
+
+    def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
+        """The magnetised shell of a record as a source of magpylib, of charged triangles; collective.
+
+        In m and T; of a case without units over R and |Br|. Each side of a cell is divided into `parts`.
+
+        Raises
+        ------
+        CaseError
+            If nothing is magnetised, or magpylib is missing.
+        """
+        from magshell_fenicsx.parts.magnetism.own_field import to_magpylib  # of few runs
+
+        return to_magpylib(self.sight, record.point.state, parts)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""

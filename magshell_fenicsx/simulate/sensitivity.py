@@ -127,7 +127,7 @@ class _Within:
 def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     """mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
     field = scene.model.loads.magnetic
-    if field is None:
+    if field is None or (field.soft and field.soft.alone):
         return {}
     within, one = scene.problem.within, np.ones(3)
     if not within:
@@ -161,7 +161,7 @@ def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
 
 
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """The model's magnetic terms with another remanence, in the fields of a state."""
+    """The model's terms of a remanence with another one, in the fields of a state; none of what is soft alone."""
     terms, fields = _made(scene, field)
     for known in fields:
         known.mu.update({name: state.mu[name] for name in known.names})
@@ -171,6 +171,9 @@ def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence
 def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
     factory = replace(model.factory, log=log, fields=fields)
+    if field.soft and field.soft.alone:
+        return [], fields
+    field = replace(field, soft=None)
     if isinstance(factory, EnergyFactory):
         return [factory.term(energy) for energy in factory.magnetic(field)], fields
     return factory.magnetic(field), fields

@@ -76,11 +76,12 @@ def _apart_from_fields(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _fields(problem: Problem) -> tuple[bool | str, ...]:
+def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
     """Which there are in the terms."""
     magnetic, natural = problem.loads.magnetic, problem.loads.natural
     grown = natural.amplitudes if natural else ()
-    return callable(magnetic and magnetic.remanent), problem.thickness is not None, *grown
+    soft = magnetic.soft.scale if magnetic and magnetic.soft else 0.0
+    return callable(magnetic and magnetic.remanent), problem.thickness is not None, soft, *grown
 
 
 def _patches(problem: Problem) -> bool:

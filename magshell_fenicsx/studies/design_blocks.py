@@ -153,7 +153,7 @@ class Vectors:
         return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
-        known = data["magnetic"].get("remanent", {})
+        known = data["magnetic"].get("remanent") or {}
         kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
         data["magnetic"]["remanent"] = {"kind": "points", "file": "", "filter": self.controls.width, **kept}
 

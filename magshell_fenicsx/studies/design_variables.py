@@ -230,10 +230,10 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
 def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]:
     """The points of the remanence, and its vectors there at the start."""
     magnetic, count, width = case.magnetic, section.points, section.filter
-    if magnetic is None or not case.lambda_m:
-        raise CaseError("design.remanence: the case has no field, so no result depends on the remanence")
+    if magnetic is None or magnetic.remanent is None or not case.lambda_m:
+        raise CaseError("design.remanence: the case has no remanence in a field, so no result depends on it")
     if count is None:
-        if not magnetic.remanent.file:
+        if not (magnetic.remanent and magnetic.remanent.file):
             raise CaseError("design.remanence: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files)
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors

@@ -222,8 +222,10 @@ def _apart_from_strength(case: Case) -> str:
     """What determines all of a scene but the size of lambda_m, which is an amplitude."""
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
+        both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None  # then their ratio counts
         magnetic.pop("lambda_m", None)
-        magnetic["remanent"].pop("flux_density", None)
+        if magnetic["remanent"] and not both:
+            magnetic["remanent"].pop("flux_density", None)
         if not case.sources:  # otherwise it is that of the field beside them
             magnetic["applied"].pop("flux_density", None)
     return json.dumps([data, bool(case.lambda_m)], sort_keys=True)

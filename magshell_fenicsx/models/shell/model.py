@@ -37,7 +37,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import by_patch, carried, cells_of
+from magshell_fenicsx.models.shell.patterns import carried, cells_of
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
@@ -115,11 +115,10 @@ class ShellModel(Thin):
     ) -> None:
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         for name in ("magnetic", "remanence"):
-            if (field := getattr(loads, name)) and field.patches:
+            if field := getattr(loads, name):
                 topology = midsurface.mesh.topology.index_map(2)
                 cells = topology.size_local + topology.num_ghosts
-                remanent = by_patch(field.patches, midsurface.patches, cells)
-                loads = replace(loads, **{name: replace(field, remanent=remanent)})
+                loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
         self.midsurface, self.material, self.degree = midsurface, material, degree
         self.load_size = {}
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -281,6 +280,10 @@ class ShellModel(Thin):
                 system.history,
             )
         )
+
+    @property
+    def mirrored_facets(self) -> NDArray[np.int32]:
+        return self._on_mirror
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement."""

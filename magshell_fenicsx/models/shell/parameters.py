@@ -1,8 +1,8 @@
 """What a shell is made of and what loads it, dimensionless."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,14 @@ from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.mesh.patch import Deviation, GivenField
 from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
+from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.natural.shape import Natural
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.magnetism.sensors import Sensor
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,12 @@ class Magnetisation:
         Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
     law
         Whether the remanence moves with F, as in the paper, or with its rotation R.
+    soft
+        What is soft; None without. Alone, it leaves `remanent` zero.
+    tesla
+        What a remanence of length one is, in T; 1 if the case has no flux densities.
+    metres
+        R in m; 0 if the case has no lengths with units, or no flux densities.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -116,11 +126,42 @@ class Magnetisation:
     driven: tuple[Driven, ...] = ()
     turns: tuple[Motion, ...] = ()
     given: GivenField | None = None
+    soft: Soft | None = None
+    tesla: float = 1.0
+    metres: float = 0.0
 
     @property
     def uniform(self) -> bool:
         """Whether the applied flux density is."""
         return self.gradient is None and self.in_space is None
+
+    def at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The applied flux density (..., 3) at points r (..., 3), so that of a uniform one lambda_m is the size."""
+        along = mu.get("lambda_m", 0.0)
+        if self.in_space and not along:
+            return np.zeros_like(r)
+        if self.in_space:
+            x = r.reshape(-1, 3)
+            B = self.in_space(x)[0] + sum((each.at(x, mu).value[0] for each in self.driven), np.zeros(3))
+            return np.asarray(along * B.reshape(r.shape))
+        uniform = along * self.applied
+        for name, across in zip(ACROSS, self.across, strict=False):
+            uniform = uniform + mu.get(name, 0.0) * across
+        if self.gradient is None:
+            return np.broadcast_to(uniform, r.shape)
+        return np.asarray(uniform + along * r @ self.gradient.T)
+
+    def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
+        """With patterns in place of what is given by named patches of a mesh with so many cells on this rank.
+
+        Raises
+        ------
+        MeshError
+            If there is no such patch.
+        """
+        remanent = by_patch(self.patches, patches, cells) if self.patches else self.remanent
+        soft = self.soft and self.soft.on(lambda of: by_patch(of, patches, cells, "magnetic.susceptibility"))
+        return replace(self, remanent=remanent, soft=soft)
 
 
 @dataclass(frozen=True)
@@ -189,6 +230,8 @@ class Loads:
         Amplitude -> imperfections that grow.
     remanence
         What is magnetised where no field is applied: it loads nothing, and is drawn.
+    sensors
+        Where its magnetic field is read.
     """
 
     pressure: bool = False
@@ -201,6 +244,7 @@ class Loads:
     contacts: tuple[Contact, ...] = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: Magnetisation | None = None
+    sensors: tuple["Sensor", ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -81,17 +81,18 @@ class WithinRims:
         found = np.tile(self.outside, (len(r0), 1))
         for inside, vector in reversed(self.within):
             found[inside(centre)] = vector
-        return np.broadcast_to(found[:, None], r0.shape)
+        return np.broadcast_to(found[:, None], (*r0.shape[:-1], len(self.outside)))
 
 
 @dataclass(frozen=True)
 class ByPatch:
-    """A vector for each cell of this rank, ghosts included: (cells, 3)."""
+    """A vector for each cell of this rank, ghosts included: (cells, size)."""
 
     vectors: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
+        there = self.vectors[: len(r0), None]  # owned cells come first
+        return np.broadcast_to(there, (*r0.shape[:-1], there.shape[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ def by_patch(
     cells: int,
     key: str = "magnetic.remanent.patches",
 ) -> ByPatch:
-    """A vector (3,) for each named patch of a mesh, and one for the "rest"; zero without.
+    """A vector for each named patch of a mesh, and one for the "rest"; zero without. All have the same size.
 
     Parameters
     ----------
@@ -166,7 +167,8 @@ def by_patch(
     MeshError
         If there is no such patch.
     """
-    found = np.tile(vectors.get("rest", np.zeros(3)), (cells, 1))
+    zero = np.zeros_like(next(iter(vectors.values())))
+    found = np.tile(vectors.get("rest", zero), (cells, 1))
     for name, vector in vectors.items():
         if name in patches:
             found[patches[name]] = vector
@@ -176,13 +178,25 @@ def by_patch(
     return ByPatch(found)
 
 
-def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> tuple[fem.Function, float | None]:
+def pattern_field(
+    pattern: Pattern,
+    r0: fem.Function,
+    finer: int = 0,
+    *,
+    name: str = "Br",
+    key: str = "magnetic.remanent",
+    size: int = 3,
+) -> tuple[fem.Function, float | None]:
     """The pattern in every cell, free to jump from cell to cell, see `shown`; collective.
 
     Parameters
     ----------
     finer
         By how much the degree of the field is above that of r0.
+    name, size
+        Of the field, and how many numbers it has.
+    key
+        Of the case, for the message.
 
     Returns
     -------
@@ -194,12 +208,12 @@ def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> tuple[f
         On every rank, if it has no finite value somewhere.
     """
     V = r0.function_space
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
     nodes, n0 = places(r0, Q.element.basix_element.points)
-    field = fem.Function(Q, name="Br")
-    refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else "magnetic.remanent")
+    field = fem.Function(Q, name=name)
+    refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
     fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
+    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
     around = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
     return field, None if fit.smooth else around * fit.size
 

@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.energy import (
     constants_of,
     per_area,
 )
-from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Edge, Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, DeadLoad, EdgeMoment, Magnetisation, Material, Potential
@@ -40,6 +40,7 @@ from magshell_fenicsx.parts.bodies.contact import (
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import FULL, LINEAR, magnetic_densities
+from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
 Array = NDArray[np.float64]
@@ -159,15 +160,53 @@ class EnergyFactory:
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m.
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m; and what is soft.
 
         A field in space is known at the displacement u.
         """
+        known = None
+        if field.in_space:
+            known = AppliedField(field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven)
+            self.fields.append(known)
+        if field.soft is None:
+            return self.remanent(field, known)
+        return [*([] if field.soft.alone else self.remanent(field, known)), self.soft(field, field.soft, known)]
+
+    def soft(self, field: Magnetisation, soft: Soft, known: AppliedField | None) -> Energy:
+        """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
+        sheet, scale = Sheet(field), self._constant(soft.scale)
+        chi, *given = self._of_sheet(sheet, soft, known)
+        parts = FIRST if field.uniform else MOVED
+        density = Density(per_area(sheet.of_surface), (chi, scale, *given), parts=parts)
+        return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
+
+    def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
+        """The integrals of the polarisation over the undeformed volume of what is modelled, over h; and that volume."""
+        if field.soft is None:
+            return {}
+        sheet, known = Sheet(field), self.fields[-1] if field.in_space else None
+        chi, *given = self._of_sheet(sheet, field.soft, known)
+        found = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
+        for axis, e in zip("xyz", np.eye(3), strict=True):
+            found[axis] = Density(per_area(sheet.induced), (chi, self._constant(e), *given))
+        return {f"induced {name}": self._over_area(self._thick(density)) for name, density in found.items()}
+
+    def _of_sheet(self, sheet: Sheet, soft: Soft, known: AppliedField | None) -> list[Parameter]:
+        """The susceptibility, the amplitudes, and the parts of the field."""
+        chi = soft.susceptibility
+        of_place = (
+            pattern_field(chi, self.carrier.r0, name="susceptibility", key="magnetic.susceptibility", size=1)[0]
+            if callable(chi)
+            else self._constant(chi)
+        )
+        amplitudes = [self.free.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes]
+        return [of_place, *amplitudes, *map(self._constant, sheet.vectors), *([known.polynomial] if known else [])]
+
+    def remanent(self, field: Magnetisation, known: AppliedField | None) -> list[Energy]:
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern, carrier = field.remanent, self.carrier
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
-        if field.in_space:
-            known = AppliedField(field.in_space, carrier.r0, self.u, carrier.rule, field.driven)
-            self.fields.append(known)
+        if known:
             of = densities.in_space(FULL[field.law])
             density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED))
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]

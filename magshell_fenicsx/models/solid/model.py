@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Magnetisation, Material, Potential
-from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, cells_of_body, places_in_body
+from magshell_fenicsx.models.shell.patterns import ByPatch, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
@@ -86,7 +86,7 @@ class SolidModel(Observed):
         mirror: Mirror = Y0,
     ) -> None:
         if loads.magnetic:
-            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=_in_cells(loads.magnetic, body)))
+            loads = replace(loads, magnetic=_in_cells(loads.magnetic, body))
         self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -117,6 +117,8 @@ class SolidModel(Observed):
             self._terms += factory.pressure(material.classical_pressure, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
+        if loads.magnetic:
+            self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])
         self.load_size, self.contacts = {}, {}
         for name, force in loads.forces.items():
             patch = outer_patch(body, V, force.point, force.patch, self.kernels)
@@ -196,17 +198,16 @@ class SolidModel(Observed):
         )
 
 
-def _in_cells(field: Magnetisation, body: Body) -> Array | Pattern:
-    """The remanence, with a vector for each cell where it is given by patches or by layers.
+def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
+    """The magnetisation, with a vector for each cell where it is given by patches or by layers.
 
     Raises
     ------
     MeshError
         If the body has no such patch.
     """
-    if field.patches:
-        return by_patch(field.patches, body.patches, len(body.between))
-    return _layered(field.layers, body) if field.layers else field.remanent
+    found = field.on(body.patches, len(body.between))
+    return replace(found, remanent=_layered(field.layers, body)) if field.layers and not field.patches else found
 
 
 def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:

@@ -23,6 +23,7 @@ from magshell_fenicsx.models.shell.patterns import (
     cells_of_body,
     inside,
     places_in_body,
+    radial,
     refuse_unbounded,
     shown,
 )
@@ -30,6 +31,7 @@ from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 
 WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
@@ -114,14 +116,53 @@ class TermFactory:
         return self._bulk("compression", self.grown(Density(densities.compression, parameters, degree=REDUCED)))
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
-        """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
-        Br = _remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        """The terms, linear in the applied field, with the amplitude lambda_m; and what is soft."""
+        known = None
         if of.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
             known = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
             self.fields.append(known)
+        if of.soft is None:
+            return self.remanent(of, known)
+        return [*([] if of.soft.alone else self.remanent(of, known)), self.soft(of, of.soft, known)]
+
+    def soft(self, field: Magnetisation, soft: Soft, known: AppliedField | None) -> SolidTerm:
+        """What the field makes of a soft body, see `EnergyFactory.soft`."""
+        sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
+        chi, n0, *given = self._of_sheet(sheet, soft, known)
+        density = Density(sheet.of_body, (chi, scale, n0, h, *given), VALUE + GRADIENT)
+        return self._bulk(TERM, density, group="magnetic", column="magnetic")
+
+    def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
+        """The integrals of the polarisation over the undeformed volume of what is modelled, and that volume."""
+        if field.soft is None:
+            return {}
+        sheet, known = Sheet(field), self.fields[-1] if field.in_space else None
+        chi, n0, *given = self._of_sheet(sheet, field.soft, known)
+        found = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
+        for axis, e in zip("xyz", np.eye(3), strict=True):
+            found[axis] = Density(sheet.induced_in_body, (chi, *self._constants(e), n0, *given))
+        return {f"induced {name}": self._over_body(density) for name, density in found.items()}
+
+    def _of_sheet(self, sheet: Sheet, soft: Soft, known: AppliedField | None) -> "list[fem.Constant | fem.Function]":
+        """The susceptibility, the normals of layers, the amplitudes, and the parts of the field."""
+        chi, V = soft.susceptibility, self.u.function_space
+        of_place = (
+            field_in_body(chi, V, name="susceptibility", key="magnetic.susceptibility", size=1)
+            if callable(chi)
+            else self._constants(chi)[0]
+        )
+        n0 = field_in_body(radial, V, name="n0")
+        amplitudes = [self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes]
+        polynomials = [known.polynomial] if known else []
+        return [of_place, n0, *amplitudes, *self._constants(*sheet.vectors), *polynomials]
+
+    def remanent(self, of: Magnetisation, known: AppliedField | None) -> list[SolidTerm]:
+        """The terms, linear in the applied field, with the amplitude lambda_m."""
+        pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
+        Br = field_in_body(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        if known:
             density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
             return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", of.applied)]
@@ -284,8 +325,17 @@ def face_measure(domain: mesh.Mesh, parts: Sequence[Facets]) -> ufl.Measure:
     return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})
 
 
-def _remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
-    """A remanence at the nodes of every cell, free to jump from cell to cell; collective.
+def field_in_body(
+    pattern: Pattern, V: fem.FunctionSpace, *, name: str = "Br", key: str = "magnetic.remanent", size: int = 3
+) -> fem.Function:
+    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Parameters
+    ----------
+    name
+        Of the field.
+    key
+        Of the case, for the message.
 
     Raises
     ------
@@ -293,9 +343,9 @@ def _remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
         On every rank, if it has no finite value somewhere.
     """
     nodes, normals = places_in_body(V)
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
-    field = fem.Function(Q, name="Br")
-    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (size,)))
+    field = fem.Function(Q, name=name)
+    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm, key)
     fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
+    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
     return field

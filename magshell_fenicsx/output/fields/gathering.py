@@ -62,7 +62,7 @@ class RevolvedGatherer:
     def _kinks(self) -> list[int]:
         """The numbers of the vertices along the meridian where given fields or the normal jump."""
         model, fields = self._model, self._fields
-        given = [fields.Br] if fields.Br.size else []
+        given = [each for each in (fields.Br, fields.susceptibility) if each.size]
         if model.loads.natural:
             given += model.loads.natural.at(inside(fields.jet[0]), fields.n0)
         if model.thickness is not None:

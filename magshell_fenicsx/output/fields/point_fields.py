@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
 from magshell_fenicsx.parts.bodies.contact import Contact
@@ -196,8 +196,8 @@ class PointFields:
         (cells, points, 3) undeformed normals.
     weight
         (cells, points) area; the weight of a cell in the mean over the cells that share a point.
-    Br
-        (cells, points, 3) the undeformed remanence; (cells, points, 0) without.
+    Br, susceptibility
+        (cells, points, 3) the undeformed remanence, (cells, points, 1) the susceptibility; (cells, points, 0) without.
     """
 
     def __init__(
@@ -215,6 +215,11 @@ class PointFields:
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
         self._carried, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
+        self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
+        if field and field.soft:
+            self.susceptibility = field.soft.at(inside(r0[0]), self.n0)[..., None]
+        if field and field.soft and field.soft.alone:
+            self._carried, field = None, None
         if self._carried:
             pattern = self._carried.remanent
             self.Br = pattern(inside(r0[0]), self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
@@ -235,6 +240,8 @@ class PointFields:
         Br, Ba
             (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux density at the
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
+        J
+            (..., 3) the polarisation mu_0 M that the field induces in what is soft, in the same unit.
         tau
             (..., 3) torque, for a uniform field.
         gap_over_h
@@ -245,7 +252,11 @@ class PointFields:
             carried = frame.convected if self._carried.law == "deformation" else frame.rotated
             found["Br"] = carried(self.Br, u)
         if self._field:
-            found["Ba"] = _applied(self._field, mu, frame.jet[0] + u[0])
+            found["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
+        if self._field and self._field.soft:
+            m = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
+            n = m / np.linalg.norm(m, axis=-1, keepdims=True)
+            found["J"] = self._field.soft.polarisation(inside(frame.jet[0]), self.n0, n, found["Ba"])
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:
@@ -262,18 +273,3 @@ class PointFields:
         b11, b12, b22 = np.einsum("d...i,...i->d...", r0[3:], self.n0)
         b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
         return SurfaceGeometry(np.moveaxis(r0[1:3], 0, -2), self.n0, b0)
-
-
-def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
-    """The applied flux density (..., 3) at points r (..., 3)."""
-    along = mu.get("lambda_m", 0.0)
-    if field.in_space and not along:
-        return np.zeros_like(r)
-    if field.in_space:
-        x = r.reshape(-1, 3)
-        B = field.in_space(x)[0] + sum((each.at(x, mu).value[0] for each in field.driven), np.zeros(3))
-        return np.asarray(along * B.reshape(r.shape))
-    uniform = along * field.applied
-    for name, across in zip(ACROSS, field.across, strict=False):
-        uniform = uniform + mu.get(name, 0.0) * across
-    return np.broadcast_to(uniform, r.shape) if field.gradient is None else uniform + along * r @ field.gradient.T

@@ -27,7 +27,7 @@ SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strain
 MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
 PRESSURE = "contact_pressure"  # of bodies, over E h/R: the mean over a cell
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
-BOTH_WAYS = {"Br", "Ba"}  # a half shell's fields may be symmetric or antisymmetric to its plane
+BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
 ON_PLANE = 1e-9  # over R
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ class SurfaceGatherer:
     def _number(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
         """Take the nodes of all cells, split between smooth parts, and the recovery on them."""
         loads, fields = self._model.loads, self._fields
-        given = [fields.Br, *(loads.natural.at(inside(r), fields.n0) if loads.natural else ())]
+        given = [fields.Br, fields.susceptibility, *(loads.natural.at(inside(r), fields.n0) if loads.natural else ())]
         thickness = self._thickness(self._places)
         given = [self._gathered(f) for f in (*given, *(() if thickness is None else (thickness,))) if f.size]
         r, n0, inner, weight = (

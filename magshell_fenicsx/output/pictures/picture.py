@@ -175,6 +175,7 @@ ALIKE = 0.2  # sine of the angle below which one arrow covers another from the s
 FIELDS = {
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$, as the shell carries it"),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
+    "J": ("C2", r"induced polarisation $\mu_0 M$"),
 }
 
 
@@ -197,8 +198,8 @@ def drawn_arrows(
     seeds = seen[spread(r[seen], APART * extent)]
     places, found = camera(r[seeds]), []
     drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in there}
-    across = _across(list(drawn.values()) or [places]) * BESIDE * extent
-    for name, side in zip(there, (1, -1), strict=False):
+    across = _across(list(drawn.values()) or [places]) * BESIDE * extent * (len(there) > 1)
+    for name, side in zip(there, (1, -1, 0), strict=False):
         shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
         found.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
     return tuple(found)

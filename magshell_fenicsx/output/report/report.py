@@ -149,14 +149,20 @@ def _head(name: str, line: Line) -> Markup:
 
 
 def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
-    of = summary["dimensionless"]
+    of, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
+    chi = magnetic.get("susceptibility")
+    field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
+    if chi is not None and "remanent" not in magnetic:
+        field = "|B<sup>a</sup>|/√(μ<sub>0</sub>E)"
     named = {
         "R/h": of["radius_to_thickness"],
         "ν": of["poisson_ratio"],
-        "λ<sub>m</sub> = |B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)": of["lambda_m"],
+        f"λ<sub>m</sub> = {field}": of["lambda_m"],
         "Λ<sub>m</sub> = λ<sub>m</sub>R/h": of["Lambda_m"],
         "p<sub>c</sub>/E": of["pc_over_E"],
     }
+    if isinstance(chi, int | float):
+        named["susceptibility χ"] = chi
     return [(Markup(name), number(v)) for name, v in named.items()]
 
 

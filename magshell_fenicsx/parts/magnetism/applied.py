@@ -7,7 +7,7 @@ is noticed, however thin that is. The amplitudes of fields that are driven are f
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
 import ufl
@@ -17,7 +17,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameters import Derivative, Parameter
+from magshell_fenicsx.assembly.parameters import Derivative, Parameter, derived
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
@@ -126,15 +126,21 @@ class AppliedField:
         flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
         return np.concatenate(flat, axis=-1)
 
-    def slope(self, name: str, other: str = "") -> PointField:
-        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes."""
+    def slope(self, name: str, other: str = "", *, moved: bool = True) -> PointField:
+        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes.
+
+        Parameters
+        ----------
+        moved
+            Whether they are about the present places; else they are changes of the polynomials there.
+        """
         field = PointField(self._u.function_space.mesh, self._degree, SIZE)
-        field.follow(lambda: self._slopes(name, other), lambda: (self.polynomial.renew(),))
+        field.follow(lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),))
         return field
 
-    def _slopes(self, name: str, other: str) -> Array:
+    def _slopes(self, name: str, other: str, *, moved: bool) -> Array:
         values = np.zeros_like(self.polynomial.values)
-        values[..., :3] = self.polynomial.values[..., :3]
+        values[..., :3] = self.polynomial.values[..., :3] if moved else 0.0
         shape = values.shape[:2]
         for here in self._here:
             if name in here.driven.names and (not other or other in here.driven.names):
@@ -179,10 +185,19 @@ class AppliedField:
 
 @dataclass(eq=False)
 class Amplitude:
-    """The value of an amplitude in a field, which takes the place of a constant in a form."""
+    """The value of an amplitude in a field, which takes the place of a constant in a form.
+
+    Attributes
+    ----------
+    terms
+        The energies of the field. Those with an amplitude are linear in it, as in the field; what is soft is quadratic.
+    """
 
     known: AppliedField
     name: str
+    terms: Sequence[FormTerm]
+    u: fem.Function
+    log: KernelLog
 
     @property
     def value(self) -> float:
@@ -192,35 +207,59 @@ class Amplitude:
     def value(self, value: float) -> None:
         self.known.mu[self.name] = float(value)
 
+    def slopes(self) -> list[FormTerm]:
+        """dPi/dmu: of what is linear in the field the energy in dB/dmu."""
+        linear = [self._instead(t, self.known.slope(self.name)) for t in self._linear]
+        return linear + [self._along(t, self.known.slope(self.name, moved=False)) for t in self._quadratic]
+
+    def bends(self, q: Any) -> Sequence[Derivative]:
+        """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its own."""
+        if not isinstance(q, Amplitude):
+            if hasattr(q, "bends"):
+                found: Sequence[Derivative] = q.bends(self)
+                return found
+            entered = [t for t in self.slopes() if q in t.form.constants()]
+            return [self._term(t, derived(t.form, q)) for t in entered]
+        if q.known is not self.known:
+            return []
+        linear = [self._instead(t, self.known.slope(self.name, q.name)) for t in self._linear]
+        both, one, other = (
+            self.known.slope(*names, moved=False) for names in ((self.name, q.name), (self.name,), (q.name,))
+        )
+        by_both = [self._along(t, both) for t in self._quadratic]
+        return linear + by_both + [self._along(self._along(t, one), other) for t in self._quadratic]
+
+    @property
+    def _linear(self) -> list[FormTerm]:
+        return [t for t in self.terms if t.amplitude is not None]
+
+    @property
+    def _quadratic(self) -> list[FormTerm]:
+        return [t for t in self.terms if t.amplitude is None]
+
+    def _instead(self, t: FormTerm, polynomial: PointField) -> FormTerm:
+        """The term with another polynomial in place of the field's own."""
+        return self._term(t, ufl.replace(t.form, {self.known.polynomial: polynomial}))
+
+    def _along(self, t: FormTerm, change: PointField) -> FormTerm:
+        """The derivative of the term along a change of the polynomial."""
+        return self._term(t, ufl.derivative(t.form, self.known.polynomial, change))
+
+    def _term(self, t: FormTerm, form: ufl.Form) -> FormTerm:
+        return FormTerm(t.name, form, self.u, self.log, t.amplitude)
+
 
 def field_parameters(
     fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
 ) -> dict[str, Parameter]:
-    """The amplitudes of driven fields, by name; collective.
-
-    The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the
-    polynomials of the derivatives.
-    """
+    """The amplitudes of driven fields, by name; collective."""
     found = {}
     for known in fields:
         own = [t for t in terms if isinstance(t, FormTerm) and known.polynomial in t.form.coefficients()]
         for name in known.names:
-            p, slopes = Amplitude(known, name), _with(own, known, known.slope(name), u, log)
+            p = Amplitude(known, name, own, u, log)
+            slopes = p.slopes()
             for each in slopes:
                 each.compile_residual()
-            found[name] = Parameter(p, slopes, partial(_twice, p, own, u, log))
+            found[name] = Parameter(p, slopes, p.bends)
     return found
-
-
-def _twice(p: Amplitude, own: Sequence[FormTerm], u: fem.Function, log: KernelLog, q: object) -> Sequence[Derivative]:
-    """Derivatives by two amplitudes of one field; none by what is not in it."""
-    if not isinstance(q, Amplitude) or q.known is not p.known:
-        return []
-    return _with(own, p.known, p.known.slope(p.name, q.name), u, log)
-
-
-def _with(
-    own: Sequence[FormTerm], known: AppliedField, instead: PointField, u: fem.Function, log: KernelLog
-) -> list[FormTerm]:
-    """The terms with another polynomial in place of the field's own."""
-    return [FormTerm(t.name, ufl.replace(t.form, {known.polynomial: instead}), u, log, t.amplitude) for t in own]

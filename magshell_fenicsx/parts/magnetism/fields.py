@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from math import isnan, pi
+from math import isnan, pi, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
 from magshell_fenicsx.input.messages import shown
@@ -16,7 +16,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
-from magshell_fenicsx.quantities.quantity import Given
+from magshell_fenicsx.quantities.quantity import Given, Quantity
+from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -26,7 +27,21 @@ Array = NDArray[np.float64]
 MU_0 = 4e-7 * pi  # T m/A
 SOURCES = 1e-9  # of the field's derivatives: rounding
 LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
+MOST_SOFT = 1e6  # of a susceptibility
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
+INDUCED = tuple(f"induced_{axis}" for axis in "xyz")
+register(
+    tuple(
+        Quantity(
+            name,
+            f"induced polarisation along e{number}",
+            f"Mean over the soft shell of the polarisation μ0 M that the field induces, along e{number}; in T, without "
+            "units over that of λ_m = 1.",
+            "load",
+        )
+        for number, name in enumerate(INDUCED, 1)
+    )
+)
 
 
 class Layer(Direction):
@@ -148,8 +163,28 @@ class AppliedSection(Direction):
         return bool(self.flux_density) if self.sources else True
 
 
+def _of_places(value: Any) -> Any:
+    """A susceptibility: a number, a formula, or numbers of patches."""
+    if isinstance(value, str):
+        formula(value)
+    elif isinstance(value, dict) and not value:
+        raise ValueError("a mapping names at least one patch")
+    else:
+        for each in value.values() if isinstance(value, dict) else [value]:
+            if isinstance(each, bool) or not isinstance(each, int | float) or not 0 <= each <= MOST_SOFT:
+                raise ValueError(f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, z")
+    return value
+
+
+Susceptibility = Annotated[
+    float | str | dict[str, float], BeforeValidator(_of_places, json_schema_input_type=float | str | dict[str, float])
+]
+
+
 class MagneticSection(Ability):
     """lambda_m, or both flux densities (and shell.youngs_modulus).
+
+    A shell with a susceptibility and without `remanent` is soft alone: λ_m = |B^a|/√(μ0 E), or applied.flux_density.
 
     Energies: full, exact; first, torque and second are the paper's expansions in the displacement;
     second_consistent has the couple too that they leave out. See docs/theory.md.
@@ -161,13 +196,41 @@ class MagneticSection(Ability):
     """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
-    remanent: RemanentSection = RemanentSection.model_construct()
-    """What is magnetised"""
+    susceptibility: Susceptibility | None = None
+    """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a number, a formula of
+    the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
+    flux densities, and always energy: full"""
+    remanent: RemanentSection | None = RemanentSection.model_construct()
+    """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""
     applied: AppliedSection = AppliedSection.model_construct()
     """The field"""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _soft_alone(cls, data: Any) -> Any:
+        """Without the key a soft shell has no remanence, and another one that along e3."""
+        if isinstance(data, dict) and data.get("susceptibility") is not None and "remanent" not in data:
+            return {**data, "remanent": None}
+        return data
+
+    @model_validator(mode="after")
+    def _what_is_soft(self) -> Self:
+        if self.remanent is None and self.susceptibility is None:
+            raise ValueError("remanent: none is of a shell with a susceptibility: give that, or leave remanent out")
+        if self.susceptibility is not None and self.energy != "full":
+            raise ValueError(f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs full")
+        if self.susceptibility is not None and self.remanent and self.lambda_m is not None:
+            raise ValueError(
+                "susceptibility: beside a remanence lambda_m does not say how strong the field is: give "
+                "remanent.flux_density and applied.flux_density"
+            )
+        return self
+
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:
+        if self.remanent is None:
+            self._one_field()
+            return self
         densities = [self.remanent.flux_density, self.applied.reference]
         if self.lambda_m is not None and self.applied.sources:
             raise ValueError("sources are in tesla: give remanent.flux_density in place of lambda_m")
@@ -175,7 +238,7 @@ class MagneticSection(Ability):
             raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
         if self.model_fields_set == {"remanence"}:
             raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
-        if self.lambda_m is None and None in densities:
+        if self.lambda_m is None and None in densities and not self.without_field:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
@@ -185,26 +248,50 @@ class MagneticSection(Ability):
             )
         return self
 
+    @property
+    def without_field(self) -> bool:
+        """Whether the remanence is alone: nothing says how strong a field is."""
+        given = self.model_fields_set
+        return self.remanent is not None and self.lambda_m is None and "remanent" in given and "applied" not in given
+
+    def _one_field(self) -> None:
+        """Of a shell that is soft alone."""
+        if self.lambda_m is not None and self.applied.reference is not None:
+            raise ValueError("give lambda_m, or the flux density (or the sources) of applied, not both")
+        if self.lambda_m is None and self.applied.reference is None:
+            raise ValueError("give lambda_m, or applied.flux_density; the shell is soft alone")
+        if self.model_fields_set & {"remanence"}:
+            raise ValueError("remanence: is a law of remanent, which this shell has not")
+
     def amplitude(self, youngs_modulus: float | None) -> float:
-        """lambda_m = |Br||Ba|/(mu_0 E)."""
+        """lambda_m = |Br||Ba|/(mu_0 E); of a shell that is soft alone |Ba|/sqrt(mu_0 E)."""
         if self.lambda_m is not None:
             return self.lambda_m
-        Br, Ba = self.remanent.flux_density, self.applied.reference
-        assert Br is not None
-        assert Ba is not None
+        if self.without_field:
+            return 0.0
+        assert self.applied.reference is not None
         assert youngs_modulus
-        return Br * Ba / (MU_0 * youngs_modulus)
+        return self.applied.reference / self.tesla(youngs_modulus)
+
+    def tesla(self, youngs_modulus: float) -> float:
+        """The applied flux density of lambda_m = 1."""
+        if self.remanent is None:
+            return sqrt(MU_0 * youngs_modulus)
+        assert self.remanent.flux_density is not None
+        return MU_0 * youngs_modulus / self.remanent.flux_density
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
 
-        return leaves(context, outline) if strength(context) else []
+        return leaves(context, outline) if strength(context) or context.sections.get("sensors") else []
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
 
-        if isinstance(self.remanent.components, list):
+        if self.remanent and isinstance(self.remanent.components, list):
             yield Formulas("magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0)
+        if isinstance(self.susceptibility, str):
+            yield Formulas("magnetic.susceptibility", [self.susceptibility], 0.0, MOST_SOFT, 1.0)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.magnetisation import adds  # the solver takes long to import
@@ -213,8 +300,10 @@ class MagneticSection(Ability):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
+        from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_sensors
         from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
 
+        refuse_unfit_sensors(context)
         lambda_m = strength(context)
         largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell
         if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:
@@ -237,7 +326,7 @@ class MagneticSection(Ability):
                     f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) {source.nowhere}; "
                     "see its position"
                 )
-        components = {"remanent": self.remanent.components, "applied": self.applied.components}
+        components = {"remanent": self.remanent and self.remanent.components, "applied": self.applied.components}
         for key, text in ((key, text) for key, each in components.items() if isinstance(each, list) for text in each):
             bad = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
             if len(bad):
@@ -278,10 +367,10 @@ class MagneticSection(Ability):
 
     def units(self, context: Context, units: Given) -> Given:
         """The flux density, or the strength of the sources, of lambda_m = 1."""
-        if not self.remanent.flux_density or isnan(units.E):
+        if isnan(units.E) or self.without_field or not (self.remanent is None or self.remanent.flux_density):
             return units
         if self.applied.beside:
-            return replace(units, applied=1e3 * MU_0 * units.E / self.remanent.flux_density)
+            return replace(units, applied=1e3 * self.tesla(units.E))
         return replace(units, strength=100 / strength(context))
 
 

@@ -1,6 +1,7 @@
 """The field section in the model's frame."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +24,15 @@ from magshell_fenicsx.models.shell.patterns import (
 )
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.sensors import sensors, units
+from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, nothing, tilted
-from magshell_fenicsx.shape.turning import beside, field_turns, vector_turns, vectors_of
+from magshell_fenicsx.shape.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
@@ -60,26 +63,9 @@ def magnetisation(
     to
         Directions that the field turns to.
     """
-    section, gradient = magnetic.remanent, magnetic.applied.gradient
-    remanent: NDArray[np.float64] | Pattern
-    if section.kind == "radial":
-        remanent = radial
-    elif section.kind == "tangential":
-        remanent = tangential
-    elif isinstance(section.components, list):
-        remanent = Components([formula(text) for text in section.components], rotation(turn) if turn else None)
-    elif section.file:
-        remanent = by_points(section, turn)
-    elif section.layers:
-        remanent = layer_average(section.layers, turn)
-    elif section.patches and not isinstance(context.shell, MeshSurface):
-        vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
-        rest = vectors.pop("rest")
-        rims = tuple((inside, vectors.get(name, rest)) for name, inside in within.items())
-        remanent = WithinRims(rims, rest) if vectors else rest
-    else:
-        remanent = section.vector(turn)
+    section, gradient = magnetic.remanent or RemanentSection.model_construct(), magnetic.applied.gradient
     known, driven = in_space(context, turn)
+    own = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
     for direction in () if known else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
@@ -89,6 +75,7 @@ def magnetisation(
     patches = None
     if section.patches and isinstance(context.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
+    remanent = _remanence(section, context, turn, within) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
     G = Q @ np.array(gradient) @ Q.T if gradient and not known else None
@@ -106,7 +93,32 @@ def magnetisation(
         driven,
         turns(context, turn),
         section.components if isinstance(section.components, GivenField) else None,
+        soft(context, turn, within),
+        own if np.isfinite(own) else 1.0,
+        context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
     )
+
+
+def _remanence(
+    section: RemanentSection, context: Context, turn: float, within: Mapping[str, Inside]
+) -> NDArray[np.float64] | Pattern:
+    """The remanence over its magnitude, without patches of a mesh."""
+    if section.kind == "radial":
+        return radial
+    if section.kind == "tangential":
+        return tangential
+    if isinstance(section.components, list):
+        return Components([formula(text) for text in section.components], rotation(turn) if turn else None)
+    if section.file:
+        return by_points(section, turn)
+    if section.layers:
+        return layer_average(section.layers, turn)
+    if section.patches and not isinstance(context.shell, MeshSurface):
+        vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
+        rest = vectors.pop("rest")
+        rims = tuple((inside, vectors.get(name, rest)) for name, inside in within.items())
+        return WithinRims(rims, rest) if vectors else rest
+    return section.vector(turn)
 
 
 def leaves(context: Context, outline: Outline) -> list[Leaves]:
@@ -114,11 +126,13 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     magnetic = context.of(MagneticSection)
     assert magnetic
     known = magnetic.applied.components if magnetic.applied.beside else None
-    alone = known or not magnetic.applied.beside
-    vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
+    alone = known or not magnetic.applied.beside or not strength(context)
+    magnetised = magnetic.remanent.directions() if magnetic.remanent else []
+    vectors = [d.vector() for d in (*magnetised, *([] if alone else [magnetic.applied]))]
     whole = turns(context)  # then the rotation is a part of the field at each place
     turning = [] if whole else [step.to.vector() for step in _rotations(context)]
-    remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
+    remanent = magnetic.remanent or RemanentSection.model_construct()
+    G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if isinstance(remanent.components, GivenField):
         return [Leaves("the remanence is a function on a mesh", mirrors=nothing)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
@@ -132,6 +146,10 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
+    if isinstance(magnetic.susceptibility, str) and not (
+        outline.span and scalar_turns(magnetic.susceptibility, outline.span)
+    ):
+        askew.append("the susceptibility differs around e3")
     sources = values(context) if magnetic.applied.sources or whole else []
     if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
         askew.append("the field of a source differs around e3")
@@ -152,7 +170,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
             return uniform and varying and kinds.get(remanent.kind, sign) == sign
 
-        return images(1.0) or images(-1.0)
+        return soft_mirrored(magnetic.susceptibility, outline, mirror) and (images(1.0) or images(-1.0))
 
     return [
         Leaves(
@@ -170,19 +188,22 @@ def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
-def adds(context: Context, modelled: Modelled) -> dict[str, Magnetisation]:
+def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it is."""
     magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    read = {"sensors": sensors(context, turn)}
     if FieldSection.amplitude in driven:
         to = [step.to for step in _rotations(context)]
-        return {"magnetic": magnetisation(magnetic, context, turn, within, to)}
+        return {"magnetic": magnetisation(magnetic, context, turn, within, to), **read}
+    if magnetic.remanent is None:
+        return read
     (part,) = leaves(context, modelled.outline)
     shown = part.askew is None or not modelled.axisymmetric
     if not shown or (modelled.plane and not part.mirrors(modelled.plane)):
-        return {}
-    return {"remanence": magnetisation(magnetic, context, turn, within)}
+        return read
+    return {"remanence": magnetisation(magnetic, context, turn, within), **read}
 
 
 def _rotations(context: Context) -> list[RotationSection]:
@@ -195,6 +216,10 @@ def account(context: Context, loads: Loads) -> Account:
     if magnetic is None or field is None:
         return Account(left_out=["magnetic energy: " + ("lambda_m is zero" if magnetic else "no magnetic section")])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
+    if field.soft:
+        chi, beside = magnetic.susceptibility, "without remanence" if field.soft.alone else "beside the remanence"
+        chi = f"{chi:g}" if isinstance(chi, int | float) else chi
+        law += f", soft magnetism of a sheet with the susceptibility {chi} {beside}"
     sources = enumerate(magnetic.applied.sources or [])
     words = [f"source {source.name or i}: {source.words()}" for i, source in sources]
     return Account([f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words])

@@ -21,6 +21,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameters import derived
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
@@ -28,8 +30,10 @@ from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.motion.mass import mass_along
+from magshell_fenicsx.parts.seen import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
@@ -128,6 +132,8 @@ class Adjoint:
         Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
     left
         Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
+    slope
+        What J is of a room, with its own derivatives by a field.
     """
 
     scene: Scene
@@ -140,6 +146,7 @@ class Adjoint:
     free: str = ""
     scale: str = ""
     left: frozenset[str] = frozenset()
+    slope: Slope | None = None
 
     @property
     def size(self) -> float:
@@ -203,16 +210,30 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
 def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:
     """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
     terms, system, mu = model.waves.along(phi, m), model.system, state.mu
+    rates = {name: by_amplitude(model, terms, name, mu) for name in names}
 
     def present() -> Functional:
         by_u = np.zeros(system.size)
         for term in terms:
             term.add_residual(by_u, factor_of(term.amplitude, mu))
         value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
-        by_mu = {name: sum((term.energy() for term in terms if term.amplitude == name), 0.0) for name in names}
+        by_mu = {name: sum((c * term.energy() for term, c in each), 0.0) for name, each in rates.items()}
         return Functional(value, system.held(by_u), by_mu)
 
     return system.at(state).of(present)
+
+
+def by_amplitude(
+    model: Observed, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
+) -> list[tuple[FormTerm, float]]:
+    """The derivatives of energies by an amplitude that multiplies some of them and may enter others; with factors."""
+    found = [(term, 1.0) for term in terms if term.amplitude == name]
+    p = model.system.parameters[name].constant if name in model.system.parameters else None
+    for term in terms:
+        if p in term.form.constants():
+            slope = FormTerm(f"{term.name} by {name}", derived(term.form, p), model.u, KernelLog(), term.amplitude)
+            found.append((slope, factor_of(term.amplitude, mu)))
+    return found
 
 
 def adjoint(
@@ -229,7 +250,7 @@ def adjoint(
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     found = functional(scene, state, column)
     held = held_at(scene, record, state, hold)
-    if free := [name for name in found.by_mu if name not in held]:
+    if free := [name for name in found.by_mu if name not in held and not found.slope]:
         raise CaseError(f"{free[0]}: is a load here, which no parameter changes: hold its conjugate")
     w, rows = solved(scene, state, found, held)
     by_itself = None if found.energy else lambda there, at: functional(there, at, column).value
@@ -238,7 +259,16 @@ def adjoint(
         by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
         w = w + found.reaction
     here = Place(state, w, rows, found.energy, found.potentials)
-    made = Adjoint(scene, [here], found.by_mu, by_itself, value=found.value, gas=with_gas(held), scale=scale)
+    made = Adjoint(
+        scene,
+        [here],
+        found.by_mu,
+        by_itself,
+        value=found.value,
+        gas=with_gas(held),
+        scale=scale,
+        slope=found.slope,
+    )
     return with_begins(made, record, begins) if hold is None else made
 
 
@@ -325,7 +355,12 @@ def by_load(adjoint: Adjoint, name: str) -> float:
         found += place.energy and place.energy * system.potential(u, mu, name)
         found += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
     if adjoint.directions:
-        terms = [(term, c) for term, c in along(scene, adjoint) if term.amplitude == name]
+        mu = adjoint.state.mu
+        terms = [
+            (slope, c * factor)
+            for term, c in along(scene, adjoint)
+            for slope, factor in by_amplitude(scene.model, [term], name, mu)
+        ]
         own = system.at(adjoint.state).of(lambda: sum(c * term.energy() for term, c in terms))
         found += system.comm.allreduce(own)
     return float(found)

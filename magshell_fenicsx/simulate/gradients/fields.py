@@ -70,6 +70,9 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if other is not scene:
         return by_field(_carried(adjoint, other), name)
     model, kind = scene.model, FIELDS[name]
+    slope = adjoint.slope
+    if slope and name in ("thickness", "deviation"):
+        raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
 
@@ -77,6 +80,8 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         """The field, and what a place gives, whose state is set."""
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
+        if f is None and slope and slope.field is not None and kind.coefficient == slope.field.name:
+            f = slope.field
         if f is None or (not model.thin and kind.coefficient != "Br"):
             raise CaseError(f"{name}: the case has no such field: no result depends on it")
         c = place.conjugates
@@ -87,6 +92,8 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
         w = _contracted(scene, place)
         forces = [summed(shares, f, model.u, w, model.kernels)]
+        if slope and slope.by_field is not None and slope.field is not None and not number:
+            forces += [slope.by_field] if kind.coefficient == slope.field.name else []
         if name == "thickness" and scene.problem.loads.contacts:
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces

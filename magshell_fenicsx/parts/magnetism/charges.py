@@ -1,0 +1,352 @@
+"""The field of a magnetised shell outside it, from the magnetic charges on its faces, edges and in it.
+
+A remanence Br that moves as F Br/J with the material has, by Nanson and Piola, charges that stay with the material:
+Br.N dA0 on its faces, -Div Br dV0 inside. So they are found on the undeformed shell, with its thickness and its
+curvature, and seen at the places x = r + zeta n of the deformed one:
+
+    B(x) = sum of q (x - x_q)/(4 pi |x - x_q|³).
+
+What moves otherwise (a remanence that turns and does not stretch, what a field induces) is first taken back to the
+undeformed shell by F. Integrals are Gauss's rules on boxes of coordinates, which are halved until each is far enough
+from the place: exact at any distance, as there is nothing else in it but the thickness as it is.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.magnetism.charged import Jets, Nodal, Shape, unit
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
+POINTS, LAYERS = 6, 6  # of Gauss's rules in a box, and of the charges through the thickness
+FAR, MOST = 2.5, 40  # radii of a box that a place is away from it, and halvings at most
+CHUNK = 40_000  # points that are found at once
+SECTORS = 8  # of a meridian's ring
+AROUND, TINY, SMALL = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 1e-6, 1e-4  # corners of a box, and what has no area
+GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # of a box
+FEET, NEWTON, BESIDE = 12, 15, 1e-6  # boxes near a place, steps to its foot there, and over R
+INSIDE = 1e-3  # of a box, as at a corner it may have no normal
+SEEN = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5], [0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]])  # of its square
+
+
+class TooNear(ValueError):
+    """A place is on the surface of the shell, or in it."""
+
+
+def gauss(n: int) -> tuple[Array, Array]:
+    """Points in [0, 1] and weights."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    return (x + 1) / 2, w / 2
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes of the coordinates (a, b) in [0, 1]² of some elements.
+
+    Attributes
+    ----------
+    of
+        (n,) the elements.
+    low, size
+        (n, 2) corners and sides.
+    """
+
+    of: Ints
+    low: Array
+    size: Array
+
+    @classmethod
+    def whole(cls, count: int) -> "Boxes":
+        return cls(np.arange(count), np.zeros((count, 2)), np.ones((count, 2)))
+
+    def __getitem__(self, which: Any) -> "Boxes":
+        return Boxes(self.of[which], self.low[which], self.size[which])
+
+    def halves(self, along: Ints) -> "Boxes":
+        """Both halves of each along one of its sides."""
+        size = self.size.copy()
+        rows = np.arange(len(size))
+        size[rows, along] /= 2
+        second = self.low.copy()
+        second[rows, along] += size[rows, along]
+        return Boxes(np.tile(self.of, 2), np.concatenate([self.low, second]), np.tile(size, (2, 1)))
+
+    def points(self, x: Array) -> Array:
+        """(n, m, 2) of points (m, 2) of the unit square."""
+        return np.asarray(self.low[:, None] + self.size[:, None] * x)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Charges at points of boxes.
+
+    Attributes
+    ----------
+    x
+        (n, m, layers, 3) where they are.
+    q
+        (n, m, layers) the charges per (a, b), without the weights of layers that are in `x`.
+    back
+        From dJ/dx (n, m, layers, 3) and dJ/dq to what it adds to dJ/d(nodal u) and dJ/d(nodal remanence), see `Family`.
+    """
+
+    x: Array
+    q: Array
+    back: Callable[[Array, Array], None] | None = None
+
+
+class Family:
+    """Elements with coordinates (a, b), of which charges can be found."""
+
+    count: int
+
+    def middle(self, boxes: Boxes, x: Array) -> Array:
+        """Places (n, m, k, 3) of points of boxes, k of them through the thickness."""
+        raise NotImplementedError
+
+    def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
+        """Charges at points x (m, 2) of the unit square times weights (m,)."""
+        raise NotImplementedError
+
+    def near(self, places: Array) -> Iterator[tuple[Boxes, Ints]]:
+        """Boxes, and for each the place it is to be seen from; far enough."""
+        corners = np.clip(SEEN, INSIDE, 1 - INSIDE)
+        boxes, of = Boxes.whole(self.count), np.arange(len(places))
+        seen, where = boxes[np.tile(np.arange(self.count), len(places))], np.repeat(of, self.count)
+        for _ in range(MOST):
+            if not len(seen.of):
+                return
+            x = self.middle(seen, corners)
+            centre, spread = x[:, 4], np.abs(x - x[:, 4:5])
+            radius = np.sqrt((spread**2).sum(axis=-1)).max(axis=(1, 2))
+            gap = np.linalg.norm(places[where][:, None] - centre, axis=-1).min(axis=-1)
+            far = gap > FAR * radius
+            if far.any():
+                yield seen[far], where[far]
+            seen, where, x = seen[~far], where[~far], x[~far]
+            sides = [np.linalg.norm(x[:, i] - x[:, j], axis=-1).max(axis=-1) for i, j in ((7, 8), (5, 6))]
+            along = (sides[1] > sides[0]).astype(np.intp)
+            seen, where = seen.halves(along), np.tile(where, 2)
+        if len(seen.of):
+            raise TooNear
+
+
+class Faces(Family):
+    """Both faces, and what is inside where the remanence varies, or `may` vary."""
+
+    def __init__(self, shape: Shape, cells: Ints, *, may: bool = False) -> None:
+        self.shape = shape
+        count = SECTORS if shape.swept else 1
+        self._cells, self._sector = np.repeat(cells, count), np.tile(np.arange(count), len(cells))
+        self._parts, self.count = count, count * len(cells)
+        spread = np.abs(shape.remanence - shape.remanence[:, :1]).max(initial=0.0)
+        even = spread <= 1e-12 * np.abs(shape.remanence).max(initial=0.0)
+        upright = not shape.swept or not np.abs(shape.remanence[..., :2]).any()
+        self._inside = [] if even and upright and not may else list(zip(*_through(), strict=True))
+
+    def _jets(self, boxes: Boxes, x: Array) -> Jets:
+        return self._jets_at(boxes, boxes.points(x))
+
+    def _jets_at(self, boxes: Boxes, ab: Array) -> Jets:
+        ab = ab.copy()
+        if self.shape.swept:
+            ab[..., 1] = (self._sector[boxes.of][:, None] + ab[..., 1]) / self._parts
+        return Jets.of(self.shape, self._cells[boxes.of], ab)
+
+    def middle(self, boxes: Boxes, x: Array) -> Array:
+        at = self._jets(boxes, x)
+        return np.stack([at.place(0.5), at.place(-0.5)], axis=2)
+
+    def holds(self, x: Array) -> bool:
+        """Whether a place (3,) is in the shell: the foot on the mid-surface is within half of the thickness."""
+        boxes, start = Boxes.whole(self.count), np.clip(GRID, INSIDE, 1 - INSIDE)
+        at = self._jets(boxes, start)
+        away = np.linalg.norm(x - at.r[0], axis=-1)
+        near = np.argsort(away.min(axis=1))[:FEET]
+        if not len(near) or away[near[0]].min() > np.ptp(at.r[0][near[0]], axis=0).max() + at.t[0][near[0]].max():
+            return False
+        boxes, ab = boxes[near], start[away[near].argmin(axis=1)][:, None]
+        for _ in range(NEWTON):
+            foot = self._jets_at(boxes, ab)
+            J = np.stack([foot.r[1], foot.r[2]], axis=-1)
+            step = np.einsum("nmdi,nmi->nmd", np.linalg.pinv(J), x - foot.r[0])
+            step[..., 1] *= self._parts
+            ab = np.clip(ab + step, INSIDE**3, 1 - INSIDE**3)
+        foot = self._jets_at(boxes, ab)
+        d, n = x - foot.r[0], unit(np.cross(foot.r[1], foot.r[2]))
+        across = np.sum(d * n, axis=-1)
+        beside = np.linalg.norm(d - across[..., None] * n, axis=-1)
+        return bool(((np.abs(across) <= foot.t[0] / 2) & (beside < BESIDE)).any())
+
+    def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
+        at = self._jets(boxes, x)
+        area = np.prod(boxes.size, axis=1)[:, None] * weights / self._parts
+        layers: list[tuple[float, tuple[Array, Array, Array]]] = []
+        for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
+            G1, G2, _ = at.layer(eta)
+            layers.append((eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1)))
+        for eta, weight in self._inside:
+            G1, G2, G3 = at.layer(eta)
+            density = -(weight * area)[..., None]
+            layers.append((eta, (0 * G1, density * np.cross(G2, G3), density * np.cross(G3, G1))))
+        return _found(at, layers, into)
+
+
+class Sides(Family):
+    """Edges of cells as strips: coordinates along the edge and through the thickness."""
+
+    def __init__(self, shape: Shape, cells: Ints, edges: Ints) -> None:
+        self.shape = shape
+        self._parts = SECTORS if shape.swept else 1
+        self._cells, self._edges = np.repeat(cells, self._parts), np.repeat(edges, self._parts)
+        self._sector = np.tile(np.arange(self._parts), len(cells))
+        self.count = len(self._cells)
+
+    def _coordinates(self, boxes: Boxes, x: Array) -> tuple[Array, Array, Array]:
+        """Coordinates (n, m, 2) of the surface, their slopes along the edge (n, 2), and heights (n, m)."""
+        s, eta = np.moveaxis(boxes.points(x), -1, 0)
+        edge = self._edges[boxes.of][:, None]
+        if self.shape.swept:
+            b = (self._sector[boxes.of][:, None] + s) / self._parts
+            along = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
+            return np.stack([np.where(edge == 1, 1.0, 0.0) + 0 * s, b], axis=-1), along[:, 0], eta - 0.5
+        # around the triangle with the surface on the left: b = 1 backwards, a = 0 backwards, b = 0
+        a = np.where(edge == 0, 1 - s, np.where(edge == 2, s, 0.0))
+        b = np.where(edge == 0, 1.0, np.where(edge == 1, 1 - s, 0.0))
+        along = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])[self._edges[boxes.of]]
+        return np.stack([a, b], axis=-1), along, eta - 0.5
+
+    def _jets(self, boxes: Boxes, x: Array) -> tuple[Jets, Array, Array]:
+        ab, along, eta = self._coordinates(boxes, x)
+        return Jets.of(self.shape, self._cells[boxes.of], ab), along, eta
+
+    def middle(self, boxes: Boxes, x: Array) -> Array:
+        at, _, eta = self._jets(boxes, x)
+        n = unit(np.cross(at.r[1], at.r[2]))
+        return np.asarray(at.r[0] + (eta * at.t[0])[..., None] * n)[:, :, None]
+
+    def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
+        at, along, eta = self._jets(boxes, x)
+        area = np.prod(boxes.size, axis=1)[:, None] * weights / (self._parts if self.shape.swept else 1)
+        G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
+        tangent = along[:, None, :1] * G1 + along[:, None, 1:] * G2
+        outward = area[..., None] * np.cross(tangent, G3)
+        return _found(at, [(eta[..., None], (outward, 0 * outward, 0 * outward))], into)
+
+
+def _through() -> tuple[Array, Array]:
+    """Heights over the thickness and weights."""
+    x, w = gauss(LAYERS)
+    return x - 0.5, w
+
+
+def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], into: Nodal | None) -> Found:
+    """Charges of layers, each with its height and with what B, B_a and B_b are multiplied by."""
+    n = unit(np.cross(at.r[1], at.r[2]))
+    x = np.stack([at.r[0] + eta * at.t[0][..., None] * n for eta, _ in layers], axis=2)
+    q = np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+    if into is None:
+        return Found(x, q)
+
+    def back(on_x: Array, on_q: Array) -> None:
+        heights = np.stack([eta * at.t[0][..., None] + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
+        by_B = [sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)]
+        at.back(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
+
+    return Found(x, q, back)
+
+
+def field(families: Sequence[Family], places: Array) -> Array:
+    """B (n, 3) at places (n, 3), of these charges.
+
+    Raises
+    ------
+    TooNear
+        If one is in the shell's surface.
+    """
+    found = np.zeros_like(places)
+    for at, of, _ in _seen(families, places, None):
+        d = places[of][:, None, None] - at.x
+        r = np.linalg.norm(d, axis=-1)
+        np.add.at(found, of, np.sum((at.q / r**3)[..., None] * d, axis=(1, 2)) / (4 * np.pi))
+    return found
+
+
+def gradient(families: Sequence[Family], place: Array, e: Array, into: Nodal) -> float:
+    """e . B at one place (3,), with its derivatives by the displacement and the remanence at nodes.
+
+    Raises
+    ------
+    TooNear
+        As `field`.
+    """
+    value = 0.0
+    for at, _, _ in _seen(families, place[None], into):
+        d = place - at.x
+        r = np.linalg.norm(d, axis=-1)
+        kernel = d @ e / (4 * np.pi * r**3)
+        value += float(np.sum(at.q * kernel))
+        slope = e / r[..., None] ** 3 - 3 * (d @ e / r**5)[..., None] * d
+        assert at.back
+        at.back(-at.q[..., None] * slope / (4 * np.pi), kernel)
+    return value
+
+
+def moment(families: Sequence[Family]) -> Array:
+    """The sum of q x, (3,): the integral of the remanence as the shell carries it."""
+    total = np.zeros(3)
+    for family in families:
+        rule, weights = square(POINTS)
+        for part in _chunks(Boxes.whole(family.count), len(weights)):
+            at = family.at(part, rule, weights)
+            total += np.einsum("nml,nmli->i", at.q, at.x)
+    return total
+
+
+def square(n: int) -> tuple[Array, Array]:
+    """Gauss's rule on the unit square."""
+    x, w = gauss(n)
+    points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(points), np.asarray(np.outer(w, w).ravel())
+
+
+def _chunks(boxes: Boxes, points: int) -> Iterator[Boxes]:
+    each = max(1, CHUNK // points)
+    for first in range(0, len(boxes.of), each):
+        yield boxes[first : first + each]
+
+
+def _seen(families: Sequence[Family], places: Array, into: Nodal | None) -> Iterator[tuple[Found, Ints, Boxes]]:
+    rule, weights = square(POINTS)
+    for family in families:
+        for boxes, of in family.near(places):
+            for first in range(0, len(of), max(1, CHUNK // len(weights))):
+                some = slice(first, first + max(1, CHUNK // len(weights)))
+                yield family.at(boxes[some], rule, weights, into), of[some], boxes[some]
+
+
+def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
+    """Flat triangles, corners (n, 3, 3), with the charges (n,) of the elements divided into parts² each."""
+    low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    count = len(low)
+    boxes = Boxes(
+        np.repeat(np.arange(family.count), count),
+        np.tile(low, (family.count, 1)),
+        np.full((family.count * count, 2), 1 / parts),
+    )
+    corners, (rule, weights) = np.clip(AROUND, TINY, 1 - TINY), square(3)
+    found = []
+    for part in _chunks(boxes, len(weights)):
+        x = family.at(part, corners, np.zeros(len(corners))).x
+        q = family.at(part, rule, weights).q.sum(axis=1).ravel()
+        quads = np.moveaxis(x, 1, 2).reshape(-1, 4, 3)
+        both = quads[:, [[0, 1, 2], [0, 2, 3]]]
+        area = np.linalg.norm(np.cross(both[:, :, 1] - both[:, :, 0], both[:, :, 2] - both[:, :, 0]), axis=-1)
+        share = area / area.sum(axis=1, keepdims=True)
+        kept = (share > SMALL).ravel()
+        found.append((both.reshape(-1, 3, 3)[kept], (share * q[:, None]).ravel()[kept]))
+    return found

@@ -1,0 +1,391 @@
+"""The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.models.shell.parameters import ACROSS, Loads, Magnetisation
+from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
+from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
+from magshell_fenicsx.parts.magnetism.fields import MU_0
+from magshell_fenicsx.parts.magnetism.sensors import Sensor
+from magshell_fenicsx.parts.magnetism.softness import parity
+from magshell_fenicsx.parts.seen import Seen, Sight, Slope
+
+if TYPE_CHECKING:
+    pass
+
+Array = NDArray[np.float64]
+JUMP = 1e-6  # of the remanence between two cells, relative
+AXIS = 1e-9  # over R
+STEP = 1e-4  # of differences of fourth order
+CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+
+
+def magnetised(loads: Loads) -> Magnetisation | None:
+    """What is magnetised, in a field or without; None if nothing is."""
+    return loads.magnetic or loads.remanence
+
+
+class OwnField:
+    """The charges of a model's shell.
+
+    Parameters
+    ----------
+    sight
+        The model; its system has the displacement and the amplitudes that are asked about.
+    """
+
+    def __init__(self, sight: Sight) -> None:
+        found = magnetised(sight.loads)
+        assert found
+        self._sight, self._model, self._field = sight, sight.model, found
+        V = sight.model.r0.function_space
+        topology = V.mesh.topology
+        self._dim = topology.dim
+        self._owned = topology.index_map(self._dim).size_local
+        pattern = found.remanent if callable(found.remanent) else Uniform(np.asarray(found.remanent))
+        self.Br = pattern_field(pattern, sight.model.r0)[0]
+        self._thickness = sight.model.thickness
+        self._plain = found.law == "deformation" and found.soft is None
+        if not self._plain:
+            carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
+            self._at = carrier.discontinuous(3).element.basix_element
+        self._edges = self._sides()
+        self._sign = self._parity(pattern)
+
+    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
+        """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
+        shape = self._shape(mu)
+        cells, edges = self._sides(every=True) if may else self._edges
+        faces = Faces(shape, np.arange(self._owned), may=may)
+        return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
+
+    def B(self, families: Sequence[Family], mu: Mapping[str, float], x: Array) -> Array:
+        """The field (3,) at a place, of a remanence of length one; nan in the shell; collective."""
+        try:
+            images = [x, *([self._sight.mirror.image(x)] if self._sight.mirror else [])]
+            if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
+                raise TooNear
+            found = field(families, x[None])[0]
+            if mirror := self._sight.mirror:
+                sign = self._signed(mu)
+                found = found + sign * mirror.reflection @ field(families, mirror.image(x)[None])[0]
+        except TooNear:
+            found = np.full(3, np.nan)
+        return np.asarray(self._model.system.comm.allreduce(found))
+
+    def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
+        """The derivatives of e . B at this rank's nodes, by the displacement and by the remanence."""
+        parts = list[Nodal]()
+        for may in (False, True) if self._plain else (True,):  # charges that are zero have derivatives
+            shape, families = self.families(mu, may=may)
+            into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
+            gradient(families, x, e, into)
+            if mirror := self._sight.mirror:
+                gradient(families, mirror.image(x), self._signed(mu) * mirror.reflection @ e, into)
+            parts.append(into)
+        into = Nodal(parts[0].by_u, parts[-1].by_remanence)
+        return into if self._plain else self._to_material(into, mu)
+
+    def moment(self, families: Sequence[Family], mu: Mapping[str, float]) -> Array:
+        """The integral of the remanence as the shell carries it over its volume, (3,) over R³; collective."""
+        found = np.asarray(self._model.system.comm.allreduce(moment(families)))
+        if mirror := self._sight.mirror:
+            found = found + self._signed(mu) * mirror.reflection @ found
+        return found
+
+    def _shape(self, mu: Mapping[str, float]) -> Shape:
+        model, V = self._model, self._model.r0.function_space
+        element, nodes, size = V.element.basix_element, V.dofmap.list[: self._owned], V.dofmap.bs
+        r0, u = (f.x.array.reshape(-1, size)[nodes] for f in (model.r0, model.system.u))
+        thick = None
+        if self._thickness is not None:
+            T = self._thickness.function_space
+            thick = T.element.basix_element, self._thickness.x.array[T.dofmap.list[: self._owned]]
+        if self._plain:
+            Q = self.Br.function_space
+            of, B = Q.element.basix_element, self._nodal()
+            return Shape(element, r0, u, of, B, model.material.h, thick, size == 2)
+        Beff = self._material(self._jets(r0), self._jets(u), mu)
+        return Shape(element, r0, u, self._at, Beff, model.material.h, thick, size == 2)
+
+    def _nodal(self, cells: int | None = None) -> Array:
+        """The remanence at the nodes of cells."""
+        Q = self.Br.function_space
+        return np.asarray(self.Br.x.array.reshape(-1, 3)[Q.dofmap.list[: self._owned if cells is None else cells]])
+
+    def _jets(self, nodal: Array) -> Array:
+        """(3, cells, nodes, 3) of a field at the nodes of what is taken back to the undeformed shell."""
+        V = self._model.r0.function_space
+        T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
+        found = np.einsum("dmk,nki->dnmi", T, nodal)
+        if self._dim == 2:
+            return np.asarray(found)
+        zero = np.zeros(found.shape[1:3])
+        parts = [(f[..., 0], zero, f[..., 1]) for f in found] + [(zero, found[0][..., 0], zero)]
+        return np.stack([np.stack(part, axis=-1) for part in parts])
+
+    def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
+        """F^-1 of the polarisation per undeformed volume, (cells, nodes, 3), over |Br|."""
+        frame, of = TangentFrame.of(np.concatenate([r0, 0 * r0])), self._field
+        n = frame.normal(u)
+        J = np.zeros_like(n)
+        if not (of.soft and of.soft.alone):
+            Q = self.Br.function_space
+            T = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
+            carried = frame.convected if of.law == "deformation" else frame.rotated
+            J = carried(np.einsum("mk,nki->nmi", T, self._nodal()), u)
+        if of.soft:
+            B = of.at(mu, r0[0] + u[0])
+            J = J + of.soft.scale**2 * of.soft.polarisation(r0[0], frame.n0, n, B)
+        r1, r2 = r0[1] + u[1], r0[2] + u[2]
+        m = np.cross(r1, r2)
+        area = np.sum(m * n, axis=-1, keepdims=True)
+        first, second = (np.sum(each * J, axis=-1, keepdims=True) / area for each in (np.cross(r2, n), np.cross(n, r1)))
+        return np.asarray(first * r0[1] + second * r0[2] + np.sum(n * J, axis=-1, keepdims=True) * frame.n0)
+
+    def _to_material(self, into: Nodal, mu: Mapping[str, float]) -> Nodal:
+        """Derivatives by what is magnetised taken on to the displacement and to the remanence."""
+        V, model = self._model.r0.function_space, self._model
+        nodes, size = V.dofmap.list[: self._owned], V.dofmap.bs
+        r0, u = (self._jets(f.x.array.reshape(-1, size)[nodes]) for f in (model.r0, model.system.u))
+        on = np.zeros_like(u)
+        for d in range(3):
+            for i in range(3):
+                for way, weight in CENTRAL:
+                    moved = u.copy()
+                    moved[d, ..., i] += way * STEP
+                    on[d, ..., i] += weight / STEP * np.sum(into.by_remanence * self._material(r0, moved, mu), axis=-1)
+        T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
+        if self._dim == 1:
+            flat = on[:2][..., [0, 2]]
+            flat[0][..., 0] += on[2][..., 1]
+            on = flat
+        by_u = into.by_u + np.einsum("dmk,dnmi->nki", T, on)
+        Q = self.Br.function_space
+        TB = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
+        known, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal())
+        for i in range(3):
+            self.Br.x.array[:] = known
+            zero = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1)
+            self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
+            change = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1) - zero
+            by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
+        self.Br.x.array[:] = known
+        return Nodal(by_u, by_B)
+
+    def _sides(self, *, every: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Own cells and their local edges at the boundary, and where the remanence jumps, or `every` one.
+
+        None on a mirror plane.
+        """
+        V = self._model.r0.function_space
+        mesh = V.mesh
+        topology, dim = mesh.topology, self._dim
+        topology.create_connectivity(dim - 1, dim)
+        topology.create_connectivity(dim, dim - 1)
+        to_cells, to_facets = topology.connectivity(dim - 1, dim), topology.connectivity(dim, dim - 1)
+        at = to_facets.array.reshape(-1, dim + 1)
+        several = np.diff(to_cells.offsets)
+        values = self._nodal(len(at))
+        largest = np.abs(values).max(initial=0.0) or 1.0
+        ends = self._ends(len(at), values)
+        cells, edges = list[int](), list[int]()
+        cut = {int(facet) for facet in self._model.mirrored_facets}
+        for cell in range(self._owned):
+            for local, facet in enumerate(at[cell]):
+                if facet in cut:
+                    continue
+                if several[facet] == 1:
+                    cells.append(cell)
+                    edges.append(local)
+                    continue
+                other = next(int(c) for c in to_cells.links(facet) if c != cell)
+                there = int(np.flatnonzero(at[other] == facet)[0])
+                if every or not self._plain or np.abs(ends[cell, local] - ends[other, there]).max() > JUMP * largest:
+                    cells.append(cell)
+                    edges.append(local)
+        found = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
+        if dim == 2:
+            return found
+        X = np.array([[0.0], [1.0]])  # a pole has no edge: local facets of an interval are its ends
+        T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
+        rho = np.einsum("mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0])
+        off = np.abs(rho[found]) > AXIS
+        return found[0][off], found[1][off]
+
+    def _ends(self, count: int, values: Array) -> Array:
+        """The remanence in the middle of each local edge, (cells, edges, 3)."""
+        middles = np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]) if self._dim == 2 else np.array([[0.0], [1.0]])
+        T = self.Br.function_space.element.basix_element.tabulate(0, middles)[0, :, :, 0]
+        return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
+
+    def _signed(self, mu: Mapping[str, float]) -> float:
+        """1 if the mirror images of what is magnetised continue it, -1 if their opposites do."""
+        sign = self._sign
+        if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
+            state = State(np.zeros(0), {**dict(mu), "lambda_m": mu.get("lambda_m", 0.0) or 1.0})
+            return parity(self._sight, self._sight.loads.magnetic, state, self._sight.mirror)
+        return sign
+
+    def _parity(self, pattern: Callable[[Array, Array], Array]) -> float:
+        mirror = self._sight.mirror
+        if mirror is None:
+            return 1.0
+        x, n = (each[: self._owned] for each in places(self._model.r0))
+        S = mirror.reflection
+        images = pattern(mirror.image(x), n @ S) @ S
+        return float(np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
+
+
+def own_field(sight: Sight) -> OwnField:
+    """That of a model, which keeps it until another remanence takes the place of its own."""
+    model, of = sight.model, magnetised(sight.loads)
+    known = vars(model).get("own_field")
+    if known is None or known[0] is not of:
+        known = vars(model)["own_field"] = (of, OwnField(sight))
+    found: OwnField = known[1]
+    return found
+
+
+class SensorsSeen(Seen):
+    """What sensors read."""
+
+    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
+        from scipy.spatial import cKDTree
+
+        if not loads.sensors or surface.nodes.shape[1] < 3:  # of a chart `sensors.depth` knows
+            return
+        corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
+        spread = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
+        near = cKDTree(np.einsum("mk,nki->nmi", spread, corners).reshape(-1, 3))
+        for each in loads.sensors:
+            if near.query(each.place)[0] < each.half:
+                raise CaseError(
+                    f"sensors.{each.name}.position: is in the shell, within half its thickness of it: place it outside"
+                )
+
+    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+        return tuple(column for each in loads.sensors for column in each.columns)
+
+    def differentiable(self, loads: Loads) -> Sequence[str]:
+        return self.columns(loads, ())
+
+    def observe(self, sight: Sight, state: State) -> dict[str, float]:
+        if not sight.loads.sensors:
+            return {}
+        readings = self._readings(sight, state, sight.loads.sensors)
+        pairs = zip(sight.loads.sensors, readings, strict=True)
+        return {column: float(B) for each, row in pairs for column, B in zip(each.columns, row, strict=True)}
+
+    def summary(self, sight: Sight, state: State) -> dict[str, Any]:
+        of = magnetised(sight.loads)
+        if of is None or not sight.loads.sensors:
+            return {}
+        own, at = own_field(sight), sight.model.system.at(state)
+        found = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
+        size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
+        return {"magnetic_moment": {"value": (size * found).tolist(), "unit": "A m²" if of.metres else "|Br| R³/μ0"}}
+
+    def slope(self, sight: Sight, state: State, column: str) -> Slope | None:
+        found = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]
+        if not found:
+            return None
+        (sensor, i), own = found[0], own_field(sight)
+        e = sensor.own * rotation(sight.azimuth)[:, i]
+        system = sight.model.system
+        at, nodes = system.at(state), sight.model.r0.function_space.dofmap.list
+
+        def derived() -> tuple[Array, Array]:
+            into, part = own.slope(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
+            size = into.by_u.shape[2]
+            np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
+            return part, into.by_remanence
+
+        part, by_remanence = at.of(derived)
+        by_mu = dict[str, float]()
+        applied = sight.loads.magnetic
+        if applied and (sensor.total or applied.soft):
+            names = {"lambda_m", *ACROSS, *(name for each in applied.driven for name in each.names)}
+            for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
+                size = STEP * (abs(value) or 1.0)
+                moved = ((way, State(state.u, {**state.mu, name: value + way * size})) for way, _ in CENTRAL)
+                values = {way: self._readings(sight, there, [sensor])[0][i] for way, there in moved}
+                by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
+        value = float(self._readings(sight, state, [sensor])[0][i])
+        return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
+
+    def _readings(self, sight: Sight, state: State, of: Sequence[Sensor]) -> list[Array]:
+        """(3,) of each, in the case's frame."""
+        Q = rotation(sight.azimuth)
+
+        def present() -> list[Array]:
+            if magnetised(sight.loads) is None:
+                return [np.zeros(3) for _ in of]
+            own = own_field(sight)
+            _, families = own.families(state.mu)
+            return [each.own * own.B(families, state.mu, each.place) for each in of]
+
+        found, applied = sight.model.system.at(state).of(present), sight.loads.magnetic
+        if applied:
+            found = [
+                B + each.applied * applied.at(state.mu, each.place[None])[0] if each.total else B
+                for each, B in zip(of, found, strict=True)
+            ]
+        return [B @ Q for B in found]
+
+
+def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
+    """The shell of a state as a source of magpylib, of charged triangles, in m and T; without units over R and |Br|.
+
+    Parameters
+    ----------
+    parts
+        Into how many parts each side of a cell is divided.
+
+    Raises
+    ------
+    CaseError
+        If nothing is magnetised, or magpylib is missing.
+    """
+    from magshell_fenicsx.parts.magnetism.sources.source import magpylib
+
+    of = magnetised(sight.loads)
+    if of is None or not hasattr(sight.model, "carrier"):
+        raise CaseError("to_magpylib: of a shell with a remanence or a susceptibility, this has neither")
+    made, own, mirror = magpylib("to_magpylib"), own_field(sight), sight.mirror
+    Q, R = rotation(sight.azimuth), of.metres or 1.0
+
+    def present() -> list[tuple[Array, Array]]:
+        _, families = own.families(state.mu)
+        found = [each for family in families for each in triangles(family, parts)]
+        if mirror:
+            sign = own._signed(state.mu)
+            found += [(mirror.image(x), sign * q) for x, q in found]
+        return found
+
+    system = sight.model.system
+    found = [each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank]
+    corners, charges = (np.concatenate([each[i] for each in found]) for i in range(2))
+    corners = R * corners @ Q
+    m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    J = (of.tesla * R**2 * charges / np.sum(m * m, axis=-1))[:, None] * m
+
+    def total(field: str, observers: Array) -> Array:
+        """Of all triangles; magpylib asks for B or H."""
+        B = np.zeros((len(observers), 3))
+        for i, x in enumerate(observers):
+            seen = np.broadcast_to(x, (len(J), 3))
+            B[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
+        return np.asarray(B / MU_0 if field == "H" else B)
+
+    return made.misc.CustomSource(field_func=total)

@@ -1,0 +1,129 @@
+"""Sensors of the magnetic field: where they are, and what they read."""
+
+from dataclasses import dataclass
+from math import nan, sqrt
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.shape.ground import Coordinates
+from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
+
+Array = NDArray[np.float64]
+STEPS, DIFFERENCE = 8, 1e-6  # of Gauss's and Newton's method for the nearest place of a surface
+
+
+class SensorSection(Section):
+    """A point at which the field is read, outside the shell: columns NAME_Bx, NAME_By and NAME_Bz of path.csv.
+
+    In T; where the case has no flux densities over |B^r|, of a shell that is soft alone over √(μ0 E).
+    """
+
+    position: Coordinates
+    """Where it is; it does not move [the shell's length; over R if that has no unit]"""
+    field: Literal["own", "total"] = "own"
+    """What it reads: the field of the magnetised shell alone, or with the applied one"""
+
+
+Sensors = Annotated[dict[str, SensorSection], Field(max_length=1000)]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor in the model's frame.
+
+    Attributes
+    ----------
+    place
+        (3,) over R.
+    total
+        Whether it reads the applied field too.
+    own, applied
+        In the unit of the columns: the field of a remanence of length one, and an applied field of lambda_m = 1.
+    half
+        Half of the thickness over R.
+    """
+
+    name: str
+    place: Array
+    total: bool
+    own: float
+    applied: float
+    half: float
+
+    @property
+    def columns(self) -> tuple[str, str, str]:
+        return f"{self.name}_Bx", f"{self.name}_By", f"{self.name}_Bz"
+
+
+def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
+    """The sensors of a case, in a frame turned about e3 (rad)."""
+    given: dict[str, SensorSection] = context.sections.get("sensors") or {}
+    shell, own = context.shell, units(context)
+    R, half = shell.reference, 0.5 / shell.R_over_h
+    return tuple(
+        Sensor(name, rotation(turn) @ np.array(each.position) / R, each.field == "total", *own, half)
+        for name, each in given.items()
+    )
+
+
+def units(context: Context) -> tuple[float, float]:
+    """What a remanence of length one and an applied field of lambda_m = 1 are: in T, or over |Br|; nan if unknown."""
+    magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
+    if magnetic is None:
+        return nan, nan
+    if magnetic.remanent is None:
+        tesla = sqrt(MU_0 * E) if E and magnetic.lambda_m is None else 1.0
+        return tesla, tesla
+    Br = magnetic.remanent.flux_density
+    return (Br, magnetic.tesla(E)) if Br and E else (Br or 1.0, nan)
+
+
+def refuse_unfit_sensors(context: Context) -> None:
+    """See that something is magnetised, and that no sensor is in the undeformed shell.
+
+    Raises
+    ------
+    CaseError
+        With the key of the sensor.
+    """
+    given: dict[str, SensorSection] = context.sections.get("sensors") or {}
+    for name, each in given.items():
+        if not name.isidentifier():
+            raise CaseError(f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns")
+        if each.field == "total" and not np.isfinite(units(context)[1]):
+            raise CaseError(
+                f"sensors.{name}.field: total: lambda_m does not say how strong the applied field is: give "
+                "remanent.flux_density and applied.flux_density, or field: own"
+            )
+        shell = context.shell
+        if not isinstance(shell, MeshSurface) and depth(shell, np.array(each.position) / shell.reference) < 0:
+            x, y, z = each.position
+            raise CaseError(
+                f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
+                "mid-surface: place it outside"
+            )
+
+
+def depth(shell: "ShellSection | Surface", x: Array) -> float:
+    """How far a place (3,) over R is from the nearest face of an undeformed shell; negative inside."""
+    from magshell_fenicsx.shape.outline import outline  # reads meshes
+
+    drawn = outline(shell)
+    chart, half = np.asarray(drawn.inverse(x), dtype=float), 0.5 / shell.R_over_h
+    for _ in range(STEPS):
+        steps = np.vstack([chart, *(chart + DIFFERENCE * e for e in np.eye(len(chart)))])
+        here, *there = drawn.embedding(steps)
+        change = np.linalg.lstsq(np.array([each - here for each in there]).T / DIFFERENCE, x - here, rcond=None)[0]
+        again = np.asarray(drawn.inverse(drawn.embedding((chart + change)[None])[0]), dtype=float)
+        if not np.isfinite(again).all():
+            break
+        chart = again
+    return float(np.linalg.norm(x - drawn.embedding(chart[None])[0])) - half
