@@ -109,7 +109,9 @@ def run(
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
     ] = None,
-    pictures: Annotated[bool, typer.Option(" /--no-pictures", help="draw none; magshell plot draws them later")] = True,
+    pictures: Annotated[
+        bool, typer.Option(" /--no-pictures", show_default=False, help="draw none; magshell plot draws them later")
+    ] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.opened import opened

@@ -45,9 +45,14 @@ class Page:
     def open(self, file: Path, width: int, height: int = 900) -> None:
         """Open a file in a window of so many pixels, and wait until the page says that it is ready."""
         self.errors.clear()
-        self._ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.resize(width, height)
         self._ask("Page.navigate", url=file.resolve().as_uri())
         self.wait("document.readyState === 'complete'")
+
+    def resize(self, width: int, height: int = 900) -> None:
+        """Give the window another size, as a phone that is turned."""
+        self._ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.wait(f"innerWidth === {width}")
 
     def wait(self, condition: str) -> None:
         """Until a condition in JavaScript holds.

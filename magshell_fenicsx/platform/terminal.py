@@ -4,13 +4,16 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
 Say = Callable[[str], None]
 ERASED = "\r\x1b[K"
 ROOM = 3  # columns for the ^C of an interrupt; a full line would wrap and could not be erased
+COLUMNS = 79  # of a line that stays, in the narrowest usual terminal
+EACH = 30.0  # seconds without a line after which a pipe gets one
 lost: list[str] = []  # why standard output is not written
 # mpirun gives every rank a terminal, even if its own output is a file
 LAUNCHERS = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
@@ -47,14 +50,14 @@ def open_standard_streams() -> None:
 
 
 @contextmanager
-def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say | None]]:
+def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Two functions: the first prints a line, the second rewrites the status line.
 
-    They are `say` and None if standard output is no terminal or there are several ranks. The status line is erased
-    after `with`, and also when SIGTERM ends the process.
+    If standard output is no terminal, or there are several ranks, the second prints a line where EACH seconds have
+    passed without one. The status line is erased after `with`, and also when SIGTERM ends the process.
     """
     if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
-        yield say, None
+        yield from _plain(say)
         return
     foot = ""
 
@@ -63,7 +66,7 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say | None]]:
 
     def rewrite(line: str) -> None:
         nonlocal foot
-        foot = line[: max(0, shutil.get_terminal_size().columns - ROOM)]
+        foot = fitting(line.split("  "), max(0, shutil.get_terminal_size().columns - ROOM))
         write(f"{ERASED}{foot}")
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -77,3 +80,36 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say | None]]:
     finally:
         signal.signal(signal.SIGTERM, before)
         write(ERASED)
+
+
+def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
+    """Both functions print lines, the second seldom."""
+    last = time.monotonic()
+
+    def stay(line: str) -> None:
+        nonlocal last
+        last = time.monotonic()
+        say(line)
+
+    def seldom(line: str) -> None:
+        if time.monotonic() - last >= EACH:
+            stay(line)
+
+    yield stay, seldom
+
+
+def fitting(parts: Sequence[str], columns: int) -> str:
+    """The first parts of a line that fit, two spaces between them; none is cut but a first one that is too long.
+
+    Examples
+    --------
+    >>> fitting(["5 points", "w/h 14 -> 20", "1:50, about 0:30 left", "du/h 0.1"], 50)
+    '5 points  w/h 14 -> 20  1:50, about 0:30 left'
+    """
+    first, *others = parts
+    found = first[:columns]
+    for part in others:
+        if len(found) + 2 + len(part) > columns:
+            break
+        found += f"  {part}"
+    return found

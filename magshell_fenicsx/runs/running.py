@@ -27,6 +27,7 @@ from magshell_fenicsx.output.store.folder import DiskError, by_first, given_fold
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform.environment import fast_blas
+from magshell_fenicsx.platform.terminal import COLUMNS, fitting
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -320,16 +321,18 @@ def _follow(
 
 
 def _line(row: Row) -> str:
+    """A point in 79 columns: what varied, the displacement, and of the other loads those that there are."""
     pressed = amplitude(str(row["amplitude"])).conjugate  # of several bodies each has its own force
     load = "load_factor" if "load_factor" in row else pressed if pressed.startswith("force_") else "force"
     formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
-    if row["amplitude"] and (varied := amplitude(str(row["amplitude"])).column) not in formats:
-        formats[varied] = "9.5f"
-    values = [_value(name, row, form) for name, form in (formats | {"w_over_h": "8.4f"}).items()]
-    pole = _value("w_pole_over_h", row, "8.4f", "pole")
+    varied = amplitude(str(row["amplitude"])).column if row["amplitude"] else ""
     beside = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
-    counts = f"unstable {row['negative_pivots']}{beside}  it {row['iterations']}"
-    return "  ".join([f"{row['point']:4d} {row['label']:>11}", *values, pole, counts])
+    unstable = [f"unstable {row['negative_pivots']}{beside}"] if row["negative_pivots"] or beside else []
+    loads = [name for name in formats if name != varied and row[name]]
+    first = [_value(varied, row, formats.get(varied, "9.5f"))] if varied else []
+    at_pole = [_value("w_pole_over_h", row, "8.4f", "pole")] if row["w_pole_over_h"] != row["w_over_h"] else []
+    parts = [*first, _value("w_over_h", row, "8.4f"), *unstable, *(_value(n, row, formats[n]) for n in loads), *at_pole]
+    return fitting([f"{row['point']:4d} {row['label']:>11}", *parts, f"it {row['iterations']}"], COLUMNS)
 
 
 def _value(name: str, row: Row, form: str, words: str = "") -> str:

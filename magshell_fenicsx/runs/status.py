@@ -171,7 +171,7 @@ class RunProgress:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
         of = f" in step {self._step} of {len(self._aims)}" if self._scene.problem.listed else ""
         ahead = self._aim.text(self._row) if self._aim else ""
-        self._report(f"{self._count}{of}  {ahead}  step {step:.2g} h  {times}")
+        self._report("  ".join(part for part in (f"{self._count}{of}", ahead, times, f"du/h {step:.2g}") if part))
 
     def doing(self, what: str) -> None:
         self._report(waiting(f"{self._count}  {what}", time.perf_counter() - self._start))

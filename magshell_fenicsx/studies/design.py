@@ -6,6 +6,7 @@ and goes on where it was interrupted.
 
 import hashlib
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
@@ -37,7 +38,7 @@ from magshell_fenicsx.studies.design_picture import draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
 from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
 from magshell_fenicsx.studies.points import identity
-from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, keep, kept
+from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, keep, kept, rest_said
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
@@ -65,6 +66,8 @@ class Design:
         The variables and the evaluations, in the same order; those of the present stage.
     stage
         Number of the wanted shape; 0 of the last.
+    seconds
+        What each new evaluation took.
     """
 
     variables: Variables
@@ -75,6 +78,7 @@ class Design:
     rows: list[dict[str, Any]] = field(default_factory=list)
     tried: list[tuple[Array, Evaluation]] = field(default_factory=list)
     stage: int = 0
+    seconds: list[float] = field(default_factory=list)
     _scene: Standing = field(default_factory=Standing)
 
     def __call__(self, x: Array) -> Evaluation:
@@ -88,7 +92,9 @@ class Design:
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
         evaluation = from_first(self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine))
         if evaluation is None:
+            begun = time.perf_counter()
             evaluation = self._new(x, vectors)
+            self.seconds.append(time.perf_counter() - begun)
             content = {**self._mine, "evaluation": asdict(evaluation)}
             from_first(self.comm, lambda: keep(file, content))
         self._add(x, evaluation, name)
@@ -132,7 +138,13 @@ class Design:
         by_first(self.comm, self._write)
         values = ", ".join(f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items())
         note = f" ({evaluation.note})" if values and evaluation.note else evaluation.note
-        self.say(f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}")
+        self.say(f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}{self._left}")
+
+    @property
+    def _left(self) -> str:
+        """How long the iterations that may follow take, if each is one evaluation."""
+        ahead = self.wanted.section.iterations + 1 - len(self.rows)
+        return rest_said(float(np.mean(self.seconds)) * ahead, "at most about ") if self.seconds and ahead > 0 else ""
 
     def _write(self) -> None:
         if not any(evaluation.values for _, evaluation in self.tried) and (self.folder / "design.csv").exists():

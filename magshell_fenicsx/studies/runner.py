@@ -142,6 +142,20 @@ def compute(
                 say(line + _rest(time.perf_counter() - begun, i + 1, len(tasks)))
 
 
+def rest_said(left: float, about: str = "about ") -> str:
+    """The rest of the time in words; empty if it is short.
+
+    Examples
+    --------
+    >>> rest_said(600.0), rest_said(8.0), rest_said(30.0, "at most about ")
+    (', about 10 min left', '', ', at most about 30 s left')
+    """
+    if left < LEAST_LEFT:
+        return ""
+    size, unit = next((size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size)
+    return f", {about}{left / size:.0f} {unit} left"
+
+
 def _rest(seconds: float, done: int, count: int) -> str:
     """How long the others take if they go on as those before.
 
@@ -150,11 +164,7 @@ def _rest(seconds: float, done: int, count: int) -> str:
     >>> _rest(60.0, 1, 11), _rest(60.0, 10, 11), _rest(90.0, 4, 5)
     (', about 10 min left', '', ', about 22 s left')
     """
-    left = seconds * (count / done - 1)
-    if left < LEAST_LEFT:
-        return ""
-    size, unit = next((size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size)
-    return f", about {left / size:.0f} {unit} left"
+    return rest_said(seconds * (count / done - 1))
 
 
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:

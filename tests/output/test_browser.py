@@ -23,6 +23,7 @@ pytestmark = [
 SPHERE = {
     "shell": {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3},
     "boundary": {"equator": "clamped"},
+    "mesh": {"degree": 2, "refinement": 0.5},
 }
 STRIP = {
     "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0.0},
@@ -95,29 +96,43 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return make
 
 
+PANES = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().toJSON())"
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, report: Any) -> None:
     """No error, nothing wider than the window; the shell in its true proportions, neither tiny nor cut off."""
-    for width in (1200, 400):
-        page.open(report(kind), width)
-        page.wait("document.body.dataset.ready === 'yes'")
-        assert page.errors == []
-        assert page.value("document.documentElement.scrollWidth") <= width
-        panes = page.value("['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().width)")
-        assert min(panes) >= 0.35 * width if width > 700 else 0.8 * width
-        ranges = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}[c + 'axis'].range)"), float)
-        ratio = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}.aspectratio[c])"), float)
-        assert np.isfinite(ranges).all()
-        assert page.value(f"{SCENE}.aspectmode") == "manual"
-        sizes = np.ptp(ranges, axis=1)
-        assert ratio / ratio.max() == pytest.approx(sizes / sizes.max(), rel=1e-6)  # a sphere is a sphere
-        places = page.value(
-            f"['x', 'y', 'z'].map(c => {DRAWN}.slice(0, -1).flatMap(t => [...t[c]].filter(v => v !== null)))"
-        )
-        drawn = np.array([[min(values), max(values)] for values in places])
-        assert (drawn[:, 0] >= ranges[:, 0]).all()
-        assert (drawn[:, 1] <= ranges[:, 1]).all()
-        assert np.ptp(drawn, axis=1).max() > 0.35 * sizes.max()
+    page.open(report(kind), 1200)
+    page.wait("document.body.dataset.ready === 'yes'")
+    assert page.value("document.documentElement.scrollWidth") <= 1200
+    left, right = page.value(PANES)
+    assert min(left["width"], right["width"]) >= 420
+    assert left["right"] <= right["left"]
+    proportions_are_true(page)
+    page.resize(400)
+    page.wait("['shell3d', 'curve2d'].every(n => document.getElementById(n)._fullLayout.width <= 400)")
+    assert page.value("document.documentElement.scrollWidth") <= 400
+    above, below = page.value(PANES)
+    assert min(above["width"], below["width"]) >= 320
+    assert above["bottom"] <= below["top"]
+    proportions_are_true(page)
+    assert page.errors == []
+
+
+def proportions_are_true(page: Page) -> None:
+    """The ranges of the axes are finite, have one scale, and hold all that is drawn without much around it."""
+    ranges = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}[c + 'axis'].range)"), float)
+    ratio = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}.aspectratio[c])"), float)
+    assert np.isfinite(ranges).all()
+    assert page.value(f"{SCENE}.aspectmode") == "manual"
+    sizes = np.ptp(ranges, axis=1)
+    assert ratio / ratio.max() == pytest.approx(sizes / sizes.max(), rel=1e-6)  # a sphere is a sphere
+    traces = f"{DRAWN}.slice(0, -1).flatMap(t => [...t[c]].filter(v => v !== null))"
+    places = page.value(f"['x', 'y', 'z'].map(c => {{const v = {traces}; return [Math.min(...v), Math.max(...v)];}})")
+    drawn = np.array(places)
+    assert (drawn[:, 0] >= ranges[:, 0]).all()
+    assert (drawn[:, 1] <= ranges[:, 1]).all()
+    assert np.ptp(drawn, axis=1).max() > 0.35 * sizes.max()
 
 
 def test_the_curve_is_that_of_the_picture(page: Page, report: Any) -> None:

@@ -90,9 +90,9 @@ def test_terminal_and_pipe(tmp_path: Path) -> None:
     assert not set("\r\x1b") & set(piped.stdout)
     feet = terminal.feet
     assert re.fullmatch(r"mesh and kernels  \d:\d\d", feet[0])
-    steps = [foot for foot in feet if " step " in foot]
-    assert re.fullmatch(r"1 point  w/h 0 -> 6  step \d\.?\d* h  \d:\d\d", steps[0])
-    assert re.fullmatch(r"\d points  w/h \d\.?\d* -> 6  step .* h  \d:\d\d, about \d:\d\d left", steps[-1])
+    steps = [foot for foot in feet if " du/h " in foot]
+    assert re.fullmatch(r"1 point  w/h 0 -> 6  \d:\d\d  du/h \d\.?\d*", steps[0])
+    assert re.fullmatch(r"\d points  w/h \d\.?\d* -> 6  \d:\d\d, about \d:\d\d left  du/h .*", steps[-1])
     assert [foot for foot in feet if "looking for modes that the model excludes" in foot]
     assert "modes and pictures" in feet[-1]
 
@@ -148,8 +148,20 @@ def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         tell("0123456789")
         say("0123456789")
     assert screen.getvalue() == "\r\x1b[K0123456\r\x1b[K0123456789\n0123456\r\x1b[K"
-    with live_line(2, print) as (say, tell):
-        assert (say, tell) == (print, None)
+
+
+def test_a_pipe_gets_a_line_each_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last status where nothing else was printed for 30 s; no control characters; on several ranks too."""
+    printed: list[str] = []
+    clock = iter([0.0, 10.0, 31.0, 40.0, 60.0, 69.0, 70.0, 70.0])
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    with live_line(2, printed.append) as (say, tell):
+        tell("at 10 s")
+        tell("at 31 s")  # two looks at the clock: the second is of the line
+        tell("at 60 s")
+        say("a point at 69 s")
+        tell("at 70 s")
+    assert printed == ["at 31 s", "a point at 69 s"]
 
 
 def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,10 +185,10 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
         progress.accepted({**row, "label": "step", "w_over_h": w}, known=known)
         progress.trying(here, 0.02)  # type: ignore[arg-type]
     assert told == [
-        "2 points  lambda_m 0.00092 -> 0.00184  step 1 h  0:50",
-        "3 points  w/h 8 -> 20  step 1 h  1:10",
-        "4 points  w/h 12 -> 20  step 1 h  1:30, about 0:30 left",  # 4 of 12 took 20 s: 40 s, 10 s ago
-        "5 points  w/h 14 -> 20  step 1 h  1:50, about 0:30 left",
+        "2 points  lambda_m 0.00092 -> 0.00184  0:50  du/h 1",
+        "3 points  w/h 8 -> 20  1:10  du/h 1",
+        "4 points  w/h 12 -> 20  1:30, about 0:30 left  du/h 1",  # 4 of 12 took 20 s: 40 s, 10 s ago
+        "5 points  w/h 14 -> 20  1:50, about 0:30 left  du/h 1",
     ]
 
 

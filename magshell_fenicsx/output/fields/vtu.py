@@ -165,8 +165,8 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
         raise ValueError("its cells have no nodes")
     if not all(np.isfinite(values).all() for values in (r0, u, n0)):
         raise ValueError("a node is nowhere")
-    jumps = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
-    return Surface(r0, u * about.h, n0, cells, fields, (), *jumps), about
+    jump, strain_jump = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
+    return Surface(r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump), about
 
 
 class FieldSeries:

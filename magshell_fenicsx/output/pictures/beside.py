@@ -95,10 +95,11 @@ class Beside:
     def _edges(self, solid: Solid, seen: Seen) -> list[Array]:
         if not (creases := solid.creases):
             return []
-        fine = np.concatenate([_divided(line) for line in creases])
-        within = WITHIN / self._window.scale
+        divided = [_divided(line) for line in creases]
+        fine, within = np.concatenate(divided), WITHIN / self._window.scale
         places = self._camera(fine)[:, :2]
         places[~(seen.shows(fine, within) & self._shell.shows(fine, within))] = np.nan
+        places[np.cumsum([len(line) for line in divided]) - 1] = np.nan  # lines are not joined
         return [places]
 
     @property
@@ -122,9 +123,9 @@ def _pieces(solid: Solid) -> Tessellation:
 
 
 def _divided(line: Array) -> Array:
-    """A line with places between its own, and an end."""
+    """A line with places between its own, the last one twice."""
     t = np.linspace(0.0, 1.0, 24 if len(line) == 2 and np.ptp(line, axis=0).max() > 0.2 else 4)[:, None]
-    return np.concatenate([(1 - t) * line[0] + t * line[-1], np.full((1, 3), np.nan)])
+    return np.concatenate([(1 - t) * line[0] + t * line[-1], line[-1:]])
 
 
 def _centres(solid: Solid) -> Array:

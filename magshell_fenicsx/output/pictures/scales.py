@@ -105,7 +105,7 @@ def colour_bar(
     title = bar.ax.set_title(of.caption, pad=3)
     if np.isfinite(room):
         wide = title.get_window_extent(FigureCanvasAgg(figure).get_renderer()).width / figure.dpi
-        title.set_fontsize(title.get_fontsize() * min(1.0, room / wide))
+        title.set_fontsize(float(title.get_fontsize()) * min(1.0, room / wide))
 
 
 def numbers(values: Sequence[float]) -> tuple[list[str], str]:
