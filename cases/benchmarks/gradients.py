@@ -1,7 +1,7 @@
 """Every number of some cases: the gradients of their results by it, and differences of whole runs on the same mesh.
 
-`python3 -m benchmarks.gradients [CASE ...]`, in `cases/`, prints the table of docs/benchmarks/gradients.md. The keys are
-all numbers that the sections of a case have, whether they are written or not.
+`python3 -m benchmarks.gradients [CASE ...]`, in `cases/`, prints the table of docs/benchmarks/gradients.md. The keys
+are all numbers that the sections of a case have, whether they are written or not.
 """
 
 import sys
@@ -28,7 +28,8 @@ from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import ELSEWHERE, number_of, on_mesh_of, size_of
 from magshell_fenicsx.simulate.record import Record
 
-STEP = 1e-4  # of what a change of a number is small against
+STEP, LONG = 1e-4, 1e-3  # of what a change of a number is small against; where it changes the result little
+WEAK = 1e-2  # of a result: what a relative change of one changes it by where steps are long
 NOTHING = 1e-8  # of a result: what a relative change of one changes it by that is rounding of the runs
 
 
@@ -149,16 +150,17 @@ def _along(found: Any, along: Any) -> float:
 def _differences(
     compare: Compared, ran: Ran, key: str, value: float, size: float, found: Mapping[str, Any]
 ) -> Iterator[Line]:
+    scales = {of: abs(ran.value(of)) / size for of in found}
+    step = LONG if any(abs(found[of]) < WEAK * scale for of, scale in scales.items()) else STEP
     try:
-        others = [with_number(compare.text, key, value + way * STEP * size) for way in (-1, 1)]
+        others = [with_number(compare.text, key, value + way * step * size) for way in (-1, 1)]
     except CaseError as e:
         yield Line(key, refused=f"{key}: no other value is allowed: {str(e).rpartition(': ')[-1]}")
         return
     ends = [Ran.of(on_mesh_of(ran.scene, other)) for other in others]
     for of, gradient in found.items():
         low, high = (end.value(of) for end in ends)
-        scale = abs(ran.value(of)) / size
-        yield Line(key, of, float(gradient), (high - low) / (2 * STEP * size), scale)
+        yield Line(key, of, float(gradient), (high - low) / (2 * step * size), scales[of])
 
 
 def main(names: Sequence[str]) -> None:

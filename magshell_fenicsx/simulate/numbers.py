@@ -126,8 +126,8 @@ def scene_with(scene: Scene, key: str, value: float) -> Scene:
         raise CaseError(f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none")
     if new.patched and _rims(new) != _rims(old):
         raise CaseError(
-            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width with a unit depends on "
-            "no other number"
+            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width with a unit "
+            "depends on no other number"
         )
     return Scene(on_mesh_of(scene, new), scene.comm)
 
