@@ -105,9 +105,11 @@ def _changed(case: Case, key: str, value: Any) -> Case:
     *path, last = key.split(".")
     part: Any = data
     for name in path:
-        part = part[int(name)] if isinstance(part, list) else part[name]
-    unit = number_and_unit(part[last])[1] if isinstance(part.get(last), str) else ""
-    part[last] = f"{value / si_size(unit)!r} {unit}" if unit else value
+        part = part[int(name)] if isinstance(part, list) else part.setdefault(name, {})
+    at = int(last) if isinstance(part, list) else last
+    known = part[at] if isinstance(part, list) else part.get(at)
+    unit = number_and_unit(known)[1] if isinstance(known, str) else ""
+    part[at] = f"{value / si_size(unit)!r} {unit}" if unit else value
     try:
         other = Case.model_validate(data, context=case.origin.context)
     except ValidationError as e:

@@ -170,16 +170,17 @@ def lengths_with_units(section: type[BaseModel], data: Mapping[str, Any], path: 
         if isinstance(value, dict):
             for inner in _sections(field.annotation):
                 yield from lengths_with_units(inner, value, f"{path}{key}.")
-        elif any(isinstance(x, str) for x in (value if isinstance(value, list) else [value])) and _is_length(
+        elif any(isinstance(x, str) for x in (value if isinstance(value, list) else [value])) and is_length(
             field.annotation, field.metadata
         ):
             yield f"{path}{key}"
 
 
-def _is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
+def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
+    """Whether a field with this annotation takes a length with a unit, or a list of these."""
     if any(isinstance(each, Measured) and each.unit == "metre" for each in metadata):
         return True
-    return any(_is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
+    return any(is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:

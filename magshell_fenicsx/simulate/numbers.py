@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.section import is_length
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.parts.part import Context
@@ -19,7 +20,19 @@ from magshell_fenicsx.problem.wanted import FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
 OF_MATERIAL = ("density", "poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")
-ELSEWHERE = ("mesh", "loading", "points", "boundary", "stability", "frequencies", "gradients", "ensemble", "design")
+OF_DEVIATION = ("imperfections", "defect")
+ELSEWHERE = (
+    "mesh",
+    "loading",
+    "points",
+    "boundary",
+    "stability",
+    "frequencies",
+    "gradients",
+    "ensemble",
+    "design",
+    "output",
+)
 
 
 def number_of(context: Context, key: str) -> float:
@@ -30,29 +43,17 @@ def number_of(context: Context, key: str) -> float:
     CaseError
         If there is no number, or one that changes the mesh, a target or the modes of the perfect shell.
     """
-    part: Any = {name: section for name, section in context.sections.items() if name != "imperfections"}
-    for name in key.split("."):
-        try:
-            part = (
-                part[int(name)]
-                if isinstance(part, list)
-                else part[name]
-                if isinstance(part, dict)
-                else _key(part, name)
-            )
-        except (LookupError, ValueError, AttributeError):
-            raise CaseError(f"{key}: the case has no such key ({name})") from None
+    part, _ = _at(context, key)
     if isinstance(part, bool) or not isinstance(part, int | float):
         raise CaseError(f"{key}: is no number that the case gives: {part!r}")
+    if isinstance(part, int):
+        raise CaseError(f"{key}: is a whole number: it has no gradient")
     if key.startswith("magnetic.remanent.layers.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the layers add up to 1: one alone has no gradient")
     section, _, rest = key.partition(".")
-    geometry = section == "shell" and rest.split(".")[0] not in OF_MATERIAL
+    geometry = section == "shell" and rest.split(".")[0] not in (*OF_MATERIAL, *OF_DEVIATION)
     if section in ELSEWHERE or geometry:
-        raise CaseError(
-            f"{key}: a number of the mesh, of the shape or of a target has no gradient here; those of imperfections at "
-            "a fold are in sensitivities"
-        )
+        raise CaseError(f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here")
     if any(section.of_perfect_shell for section in (context.sections.get("imperfections") or {}).values()):
         raise CaseError(
             f"{key}: the modes of the perfect shell, which the case has as imperfections, change with it: give their "
@@ -61,12 +62,39 @@ def number_of(context: Context, key: str) -> float:
     return float(part)
 
 
-def _key(part: Any, name: str) -> Any:
-    if isinstance(part, dict):
-        return part[name]
-    if name not in type(part).model_fields:
-        raise AttributeError(name)
-    return getattr(part, name)
+def size_of(context: Context, key: str) -> float:
+    """What a change of the number at a key is small against.
+
+    The number itself; of a zero the largest number of its list, of a zero length R in the case's unit, else one.
+    """
+    value, is_a_length = _at(context, key)
+    beside, _ = _at(context, key.rpartition(".")[0])
+    numbers = [v for v in beside if isinstance(v, float | int)] if isinstance(beside, list) else []
+    return abs(value) or max(map(abs, numbers), default=0.0) or (context.shell.reference if is_a_length else 1.0)
+
+
+def _at(context: Context, key: str) -> tuple[Any, bool]:
+    """What stands at a key, and whether it is a length by the type of its section.
+
+    Raises
+    ------
+    CaseError
+        If there is no such key.
+    """
+    part: Any = {name: section for name, section in context.sections.items() if name != "imperfections"}
+    a_length = False
+    for name in key.split("."):
+        try:
+            if isinstance(part, list):
+                part = part[int(name)]
+            elif isinstance(part, dict):
+                part = part[name]
+            else:
+                field = type(part).model_fields[name]
+                part, a_length = getattr(part, name), is_length(field.annotation, field.metadata)
+        except (LookupError, ValueError, AttributeError):
+            raise CaseError(f"{key}: the case has no such key ({name})") from None
+    return part, a_length
 
 
 def refuse_unknown_parameters(context: Context, names: Iterable[str], start: State) -> None:
@@ -98,15 +126,17 @@ def scene_with(scene: Scene, key: str, value: float) -> Scene:
         raise CaseError(f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none")
     if new.patched and _rims(new) != _rims(old):
         raise CaseError(
-            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh: give its width a unit"
+            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width with a unit "
+            "depends on no other number"
         )
     return Scene(on_mesh_of(scene, new), scene.comm)
 
 
-def _rims(problem: Problem) -> list[float]:
+def _rims(problem: Problem) -> list[object]:
+    """Where the rims of patches are."""
     shell = problem.context.shell
     local = [each for each in problem.imperfections.values() if isinstance(each, LocalSection)]
-    return [each.half_width(shell.R_over_h, shell.poisson_ratio) for each in local if each.patch]
+    return [(each.half_width(shell.R_over_h, shell.poisson_ratio), each.at) for each in local if each.patch]
 
 
 def on_mesh_of(scene: Scene, new: Problem) -> Problem:

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import TypeAlias
+
+import numpy as np
 
 from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.assembly.terms import factor_of
@@ -16,14 +18,16 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, adjoint_
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with
+from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, size_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
-STEP = 1e-4  # of a number, or of one where it is smaller
-BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than what they move by
+STEP = 1e-4  # of what a change of a number is small against
+STRAIGHT = 1e-3  # of a difference: what it changes by over a step where one of second order is exact to some 1e-8
+BOTH, FOUR = (-1, 1), (-2, -1, 1, 2)  # places of differences of second and fourth order, in steps
+ONE_SIDE = ((0, 1, 2, 3, 4), (0, -1, -2, -3, -4))  # where numbers on the other side are not allowed
 Gradient: TypeAlias = float | FieldGradient
 
 
@@ -47,12 +51,14 @@ def by_number(adjoint: Adjoint, key: str) -> float:
         )
 
     def contracted(p: float) -> float:
-        other, first, total = scene_with(scene, key, p), adjoint.places[0], 0.0
+        other = scene if p == value else scene_with(scene, key, p)
+        first, total = adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
             own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
             state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
             state = other.model.system.placed(state)
-            _expand(scene, other, place.state)
+            if other is not scene:
+                _expand(scene, other, place.state)
             total += _at(scene, other, place, state) + (
                 0.0 if adjoint.by_itself and place is first else _own(other, place, state)
             )
@@ -62,23 +68,36 @@ def by_number(adjoint: Adjoint, key: str) -> float:
         energies = other.model.system.at(state).of(lambda: sum(c * t.energy() for c, t in terms))
         return float(total + other.model.system.comm.allreduce(energies))
 
-    return _slope(contracted, value, BESIDE if scene.model.contacts else STEP)
+    return _slope(contracted, value, size_of(scene.problem.context, key))
 
 
-def _slope(f: Callable[[float], float], value: float, part: float = STEP) -> float:
-    """df/dp at a value by a difference of second order, on the side where numbers are allowed."""
-    step, found, refused = part * (abs(value) or 1.0), dict[int, float](), list[CaseError]()
-    for way in (1, -1):
+def _slope(f: Callable[[float], float], value: float, size: float) -> float:
+    """df/dp at a value by a difference of numbers that are allowed; a change is small against `size`.
+
+    At a held displacement an energy or a pressing body is far stiffer in a number than the equilibrium: by a natural
+    stretch e the energy changes by E h R^2 of e^2, and its derivative may be 1e-4 of that. A difference of second order
+    then has the third derivative in it. Where the values are not straight over a step, it is one of fourth order.
+    """
+    step, refused, at = STEP * size, list[CaseError](), cache(f)
+
+    def difference(nodes: Sequence[int]) -> float:
+        values = [at(value + i * step) for i in nodes]
+        powers = np.vander(np.array(nodes, dtype=float), increasing=True).T
+        weights = np.linalg.solve(powers, np.eye(len(nodes))[1])  # exact of polynomials
+        return float(weights @ values) / step
+
+    try:
+        low, high = (at(value + i * step) for i in BOTH)
+        if abs(low - 2 * at(value) + high) <= STRAIGHT * abs(high - low):
+            return difference(BOTH)
+    except CaseError:
+        pass
+    for nodes in (FOUR, *ONE_SIDE):
         try:
-            found[way] = f(value + way * step)
+            return difference(nodes)
         except CaseError as e:
             refused.append(e)
-    if len(found) == 2:
-        return (found[1] - found[-1]) / (2 * step)
-    if not found:
-        raise refused[0]
-    ((way, near),) = found.items()
-    return way * (4 * near - 3 * f(value) - f(value + 2 * way * step)) / (2 * step)
+    raise refused[0]
 
 
 def size_by_number(adjoint: Adjoint, key: str) -> float:
@@ -86,8 +105,8 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     if not adjoint.scale:
         return 0.0
     problem = adjoint.scene.problem
-    value = number_of(problem.context, key)
-    return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value)
+    value, size = number_of(problem.context, key), size_of(problem.context, key)
+    return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value, size)
 
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:
