@@ -1,12 +1,12 @@
-"""The boundary of stability: a fold or a bifurcation followed in a second number p of its system, through turning points.
+"""The boundary of stability: a fold or a bifurcation followed in a second number p, through turning points.
 
 A fold is R(u, mu, p) = 0 and g(u, mu, p) = 0, a bifurcation R + beta b = 0, g = 0 and v . R_mu = 0, with g and v of
-`fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. With p unknown too, both are curves, which are followed by arc length
-in (u, mu, p) (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 3 and 4). A Newton
-step takes one factorisation and a back-solve for each of R, R_mu and R_p.
+`fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. With p unknown too, both are curves, which are followed by arc
+length in (u, mu, p) (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 3 and 4). A
+Newton step takes one factorisation and a back-solve for each of R, R_mu and R_p.
 
-Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at which
-v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
+Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at
+which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +16,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
-from magshell_fenicsx.continuation.bifurcation import _mixed as mixed_third
+from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
 from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, third, times_tangent
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
@@ -28,10 +28,7 @@ LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
 MOST_ITERATIONS = 8
 LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
 EASY = 2  # iterations after which a step grows
-MOST_TURN, STRAIGHT = (
-    0.6,
-    0.95,
-)  # cosines of successive tangents: a sharper turn is refused; a straighter one lets steps grow
+MOST_TURN, STRAIGHT = 0.6, 0.95  # cosines of successive tangents: less is refused; with more, steps grow
 GAP = 0.5  # of a step: a larger correction of its prediction counts as a jump
 ALIKE = 0.5  # cosine of successive null vectors
 SMALLEST = 1e-4  # of the first step
@@ -96,7 +93,6 @@ class Locus:
     pull: float
     second: float
     load_error: float
-    iterations: int
     factorisations: int
 
 
@@ -188,9 +184,9 @@ class Boundary:
             yield "point", found
             straight = self.inner(here.way, found.way) > STRAIGHT
             step, before, here = length, (here, length), found
-            if found.iterations <= EASY and straight:
+            if found.factorisations <= EASY and straight:
                 length = 1.5 * length
-            elif found.iterations > 2 * EASY:
+            elif found.factorisations > 2 * EASY:
                 length = 0.7 * length
             length = min(length, 1.2 * most / max(abs(here.way.dp), 1e-300), 3 * first, 2 * step)
         raise BoundaryLost(f"{MOST_POINTS} points have not reached the end of the range")
@@ -303,10 +299,9 @@ class Boundary:
         """The point near a guess on which a row holds, or the reason why there is none."""
         u, mu, name = state.u, state.mu[self.name], self.name
         beside = self.family.beside(p)
-        sizes, changes, before = list[float](), list[float](), 0
+        sizes, changes = list[float](), list[float]()
         while True:
             newton = self.family.at(p)
-            before = before or newton.factorisation.count
             system, here = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
                 tangent = AugmentedTangent(newton, here, b)
@@ -355,8 +350,7 @@ class Boundary:
             pull=lines.t_mu / scale,
             second=_second(tangent, system) if look else np.nan,
             load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
-            iterations=len(sizes),
-            factorisations=newton.factorisation.count - before,
+            factorisations=len(sizes),
         )
 
 
@@ -373,9 +367,8 @@ class _Lines:
         beside: Sequence[tuple[float, float]],
     ) -> None:
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
-        self._others = [
-            (weight, family.at(q).system, {**family.amplitudes(q), name: state.mu[name]}) for weight, q in beside
-        ]
+        own = {name: state.mu[name]}
+        self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
         v, u = tangent.v, state.u
         self.w_R, self.t_R = tangent.solve(system.residual(u, state.mu))
         self._R_mu = system.load(u, state.mu, name)
@@ -408,10 +401,7 @@ class _Lines:
 
         on_v, on_mu = along(self.cubic), dot(comm, v, self.K_mu_v)
         singular = [on_v[0] + on_mu, on_v[1] + dot(comm, v, self.K_p_v), on_v[2], on_v[3] - g]
-        if kind == "fold":
-            own = [self.t_mu, self.t_p, -t.g, t_R]
-        else:
-            own = self._without_work(along, pull)
+        own = [self.t_mu, self.t_p, -t.g, t_R] if kind == "fold" else self._without_work(along, pull)
         c = along(row.du) if row.du is not None else [0.0] * 4
         place = [c[0] + row.dmu, c[1] + row.dp, c[2], c[3] + value if value is not None else -1.0]
         rows = np.array([singular, own, place])
