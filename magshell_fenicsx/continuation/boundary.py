@@ -115,10 +115,20 @@ class Boundary:
         The amplitude that is unknown.
     scales
         Of the amplitude and of p: changes that count as of order one in the arc length.
+    recorded
+        Gets each solve, and gives its result or that of an interrupted boundary at this place.
     """
 
-    def __init__(self, family: Family, name: str, kind: Kind, scales: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        family: Family,
+        name: str,
+        kind: Kind,
+        scales: tuple[float, float],
+        recorded: "Callable[[Callable[[], Locus | str]], Locus | str]" = lambda solve: solve(),
+    ) -> None:
         self.family, self.name, self.kind, self.scales = family, name, kind, scales
+        self._recorded = recorded
         self._weight = 0.0
 
     def inner(self, a: Way, b: Way) -> float:
@@ -297,6 +307,11 @@ class Boundary:
         self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool = False
     ) -> Locus | str:
         """The point near a guess on which a row holds, or the reason why there is none."""
+        return self._recorded(lambda: self._by_newton(p, state, b, row, near, look=look))
+
+    def _by_newton(
+        self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool
+    ) -> Locus | str:
         u, mu, name = state.u, state.mu[self.name], self.name
         beside = self.family.beside(p)
         sizes, changes = list[float](), list[float]()

@@ -19,7 +19,6 @@ from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.numbers import on_mesh_of
@@ -276,6 +275,3 @@ def _box(shape: object) -> tuple[Array, Array] | None:
     box: tuple[Array, Array] | None = getattr(shape, "box", None)
     radius = getattr(shape, "radius", None)
     return (np.zeros(2), np.full(2, radius)) if radius is not None else box
-
-
-__all__ = ["Again", "NoInfluence", "Shape", "Varied", "instability", "moved"]
