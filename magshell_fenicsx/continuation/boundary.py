@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
+from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
 from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
@@ -34,6 +35,8 @@ ALIKE = 0.5  # cosine of successive null vectors
 SMALLEST = 1e-4  # of the first step
 SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
 MOST_TRIALS, MOST_POINTS = 12, 400
+MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
+SYMMETRIC = 1e-4  # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
 ROUNDING = 1e-12  # relative, of an amplitude
 SOLVES = 25  # of the power iteration for a second eigenvalue near zero
 
@@ -42,13 +45,17 @@ class Family(Protocol):
     """Systems that differ by a number p, with the same unknowns."""
 
     def at(self, p: float) -> BorderedNewton:
-        """The solver of the system at p."""
+        """The solver of the system at p; it may raise `NoSystem`."""
 
     def amplitudes(self, p: float) -> dict[str, float]:
         """The amplitudes beside the one that is unknown."""
 
     def beside(self, p: float) -> Sequence[tuple[float, float]]:
         """Weights and values of p of a difference: the derivative by p is the weighted sum of what is there."""
+
+
+class NoSystem(RuntimeError):
+    """There is no system at this value of p; the message gives the reason."""
 
 
 class BoundaryLost(RuntimeError):
@@ -177,20 +184,24 @@ class Boundary:
         length = first = min(most / max(abs(here.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5)
         for _ in range(MOST_POINTS):
             guess = self._ahead(before, here, length)
-            found = self._at_distance(here, guess, length)
+            if not ends[0] < guess.dp < ends[1]:
+                last = self._last(before, here, length, ends)
+                if last:
+                    yield from self._between(here, *last)
+                    yield "end", last[0]
+                    return
+            found = "the end of the range is not reached at once"
+            if ends[0] < guess.dp < ends[1]:
+                found = self._at_distance(here, guess, length)
             if isinstance(found, str):
                 length /= 2
                 if length < SMALLEST * first:
                     raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {found}")
                 continue
             yield from self._between(here, found, length)
-            if not ends[0] < found.p < ends[1]:
-                end = ends[0] if found.p <= ends[0] else ends[1]
-                last = self._at_p(here, found, length, end)
-                if last is None:
-                    raise BoundaryLost(f"the last point, at {end:.6g}, is not found")
-                yield "end", last
-                return
+            if not ends[0] < found.p < ends[1]:  # the prediction had not shown it
+                length /= 2
+                continue
             yield "point", found
             straight = self.inner(here.way, found.way) > STRAIGHT
             step, before, here = length, (here, length), found
@@ -255,13 +266,23 @@ class Boundary:
             return "the boundary turns too sharply"
         return found
 
-    def _at_p(self, low: Locus, high: Locus, length: float, p: float) -> Locus | None:
-        """The point between two others, or at the end of them, with a given p."""
-        t = (p - low.p) / (high.p - low.p)
-        guess = self._hermite(low, high, length, t)
-        row = _Row(None, 0.0, 1.0, lambda u, mu, q: q - p)
-        found = self._solved(p, State(guess.du, {self.name: guess.dmu}), high.phi, row, high)
-        return None if isinstance(found, str) else found
+    def _last(
+        self, before: tuple[Locus, float] | None, here: Locus, length: float, ends: tuple[float, float]
+    ) -> tuple[Locus, float] | None:
+        """The point at the end of the range, and its distance; None if the boundary does not go there at once."""
+        low, high = 0.0, length
+        for _ in range(50):  # where the prediction leaves the range
+            middle = (low + high) / 2
+            inside = ends[0] < self._ahead(before, here, middle).dp < ends[1]
+            low, high = (middle, high) if inside else (low, middle)
+        guess = self._ahead(before, here, high)
+        end = float(min(ends, key=lambda end: abs(end - guess.dp)))
+        row = _Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
+        found = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
+        if isinstance(found, str) or found.way.dp * here.way.dp < 0 or self.inner(found.way, here.way) < MOST_TURN:
+            return None
+        off = Way(found.state.u - guess.du, found.state.mu[self.name] - guess.dmu, 0.0)
+        return None if np.sqrt(self.inner(off, off)) > GAP * high else (found, high)
 
     def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
         """Where p turns between two points: the stationary point of the cubic through both, repeated."""
@@ -271,8 +292,9 @@ class Boundary:
             s = _zero_of_slope(a, low, b, high, base, self)
             guess = self._hermite(low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a))
             found = self._at_distance(base, guess, s)
-            if isinstance(found, str):
-                break
+            if isinstance(found, str):  # rounding: the cubic is as good
+                state = best.state.with_(guess.du, self.name, float(guess.dmu))
+                return replace(best, p=float(guess.dp), state=state)
             best = found if abs(found.way.dp) < abs(best.way.dp) else best
             other, gap = (high, b - s) if found.way.dp * low.way.dp > 0 else (low, s - a)
             curvature = abs(other.way.dp - found.way.dp) / gap
@@ -283,25 +305,31 @@ class Boundary:
         return best
 
     def _meeting(self, low: Locus, high: Locus, length: float) -> Locus | None:
-        """Where a second eigenvalue is zero between two points: by secants, within the bracket of the inertia."""
-        first, last, a, b = low, high, 0.0, length
-        known: list[tuple[float, float]] = []
-        found: Locus | None = None
-        for _ in range(MOST_TRIALS):
+        """Where a second eigenvalue is zero between two points, by inverse interpolation.
+
+        The bordered tangent is singular there, so the point itself is interpolated between others close by.
+        """
+        known, a, b = list[tuple[float, float, Locus]](), 0.0, length
+        s = length / 2
+        while len(known) < MOST_LOOKS:
+            tried = self._at_distance(low, self._hermite(low, high, length, s / length), s, look=True)
+            if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in known):
+                break
+            known = sorted([*known, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
+            a, b = (s, b) if tried.unstable == low.unstable else (a, s)
             s = (a + b) / 2
             if len(known) > 1:
-                (x0, y0), (x1, y1) = known[-2:]
-                s = min(max(x1 - y1 * (x1 - x0) / (y1 - y0) if y1 != y0 else s, a), b)
-            tried = self._at_distance(low, self._hermite(first, last, length, s / length), s, look=True)
-            if isinstance(tried, str):  # the bordered tangent is singular where they meet
-                return found
-            close = bool(known) and abs(s - known[-1][0]) < 1e-7 * length
-            found = tried
-            known.append((s, tried.second))
-            if close:
-                return found
-            a, b = (s, b) if tried.unstable == low.unstable else (a, s)
-        return found
+                ahead = _interpolated([each[1] for each in known], [each[0] for each in known], 0.0)
+                s = ahead if a < ahead < b else s
+                if abs(s - known[0][0]) < CLOSE * length:
+                    break
+        if len(known) < 2:
+            return known[0][2] if known else None
+        places, mu = [each[0] for each in known], self.name
+        found, loads = known[0][2], [each[2].state.mu[mu] for each in known]
+        p, load = _interpolated(places, [each[2].p for each in known], s), _interpolated(places, loads, s)
+        error = abs(load - _interpolated(places[:-1], loads[:-1], s))
+        return replace(found, p=p, state=found.state.with_(found.state.u, mu, load), load_error=error)
 
     def _solved(
         self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool = False
@@ -312,7 +340,13 @@ class Boundary:
     def _by_newton(
         self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool
     ) -> Locus | str:
-        u, mu, name = state.u, state.mu[self.name], self.name
+        try:
+            return self._iterated(float(p), state, b, row, near, look=look)
+        except NoSystem as e:
+            return str(e)
+
+    def _iterated(self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool) -> Locus | str:
+        u, mu, name = state.u, float(state.mu[self.name]), self.name
         beside = self.family.beside(p)
         sizes, changes = list[float](), list[float]()
         while True:
@@ -320,7 +354,7 @@ class Boundary:
             system, here = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
                 tangent = AugmentedTangent(newton, here, b)
-                lines = _Lines(system, here, name, tangent, self.family, beside)
+                lines = _Lines(system, here, name, tangent, self.family, beside, self.scales)
                 way = lines.step(self.kind, row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"
@@ -331,7 +365,7 @@ class Boundary:
                 return "Newton's method diverges"
             if len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], TOLERANCE):
                 return "Newton's method diverges"
-            u, mu, p = u + way.du, mu + way.dmu, p + way.dp
+            u, mu, p = u + way.du, float(mu + way.dmu), float(p + way.dp)
             rate = min(sizes[-1] / sizes[-2], 0.5) if len(sizes) > 1 and sizes[-2] else 0.5
             rest = rate / (1 - rate)
             slow = sizes[-1] > sizes[-2] / 2 if len(sizes) > 1 else False
@@ -343,7 +377,7 @@ class Boundary:
         last = self.family.at(p).system
         lines.balance(last.residual(u, {**self.family.amplitudes(p), name: mu}))
         rest_of = lines.step(self.kind, row, row.value(u, mu, p), settled=True)
-        u, mu, p = u + rest_of.du, mu + rest_of.dmu, p + rest_of.dp
+        u, mu, p = u + rest_of.du, float(mu + rest_of.dmu), float(p + rest_of.dp)
         v = b / np.sqrt(dot(system.comm, b, b))
         if near is not None:
             cosine = dot(system.comm, v, near.phi)
@@ -380,7 +414,9 @@ class _Lines:
         tangent: AugmentedTangent,
         family: Family,
         beside: Sequence[tuple[float, float]],
+        scales: tuple[float, float],
     ) -> None:
+        self._scales, self._largest = scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
         own = {name: state.mu[name]}
         self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
@@ -420,9 +456,13 @@ class _Lines:
         c = along(row.du) if row.du is not None else [0.0] * 4
         place = [c[0] + row.dmu, c[1] + row.dp, c[2], c[3] + value if value is not None else -1.0]
         rows = np.array([singular, own, place])
-        size = np.abs(rows[:, :3]).max(axis=1, keepdims=True)
-        rows = rows / np.where(size, size, 1.0)
-        dmu, dp, alpha = np.linalg.solve(rows[:, :3], -rows[:, 3])
+        columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
+        rows[:, :3] *= columns
+        size = np.abs(rows[:, :3]).max(axis=1)
+        if kind == "bifurcation":
+            size[1] = max(size[1], self._largest * columns[2])
+        rows /= np.where(size, size, 1.0)[:, None]
+        dmu, dp, alpha = columns * np.linalg.lstsq(rows[:, :3], -rows[:, 3], SYMMETRIC if kind != "fold" else None)[0]
         return Way(alpha * v - w_R - dmu * self.w_mu - dp * self.w_p, float(dmu), float(dp))
 
     def _without_work(self, along: Callable[[Vector], list[float]], pull: float) -> list[float]:
@@ -430,6 +470,7 @@ class _Lines:
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
         v, w = self._tangent.v, self.w_mu
         mixed = mixed_third(system, state, v, w) - self.K_mu_v
+        self._largest = dot(comm, np.abs(mixed), np.abs(v))
         mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
         ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
         by_mu = dot(comm, v, (ahead - back) / (2 * d)) - dot(comm, w, self.K_mu_v)
@@ -448,6 +489,11 @@ def _second(tangent: AugmentedTangent, system: System) -> float:
         value = dot(system.comm, x, x) / dot(system.comm, x, y)
         x = y / np.sqrt(dot(system.comm, y, y))
     return float(value)
+
+
+def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
+    """The polynomial through some points."""
+    return float(barycentric_interpolate(x, y, at))
 
 
 def _turned(locus: Locus) -> Locus:

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.boundary import NoSystem
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -53,8 +54,8 @@ def instability(records: Sequence[Record]) -> Record:
     located = [record for record in own if record.label in LOCATED and record.step == own[-1].step]
     if not located:
         raise CaseError(
-            "the case ends without an instability: a boundary is that of a fold or a bifurcation, so give its last step "
-            "until: limit, and a load that reaches one"
+            "the case ends without an instability, and a boundary is that of a fold or a bifurcation: give its last "
+            "step until: limit, and a load that reaches one"
         )
     return located[0]
 
@@ -143,11 +144,11 @@ class Varied:
         try:
             for q in (p - d, p + d):
                 self.problem(q)
-        except CaseError:
+        except NoSystem:
             sign = 1.0
             try:
                 self.problem(p + 2 * d)
-            except CaseError:
+            except NoSystem:
                 sign = -1.0
             return [(-1.5 * sign / d, p), (2 * sign / d, p + sign * d), (-0.5 * sign / d, p + 2 * sign * d)]
         return [(0.5 / d, p + d), (-0.5 / d, p - d)]
@@ -161,9 +162,18 @@ class Varied:
         return (self._base if self.alone else self._stage(p)).scene
 
     def problem(self, p: float) -> Problem:
-        """The problem at a value."""
+        """The problem at a value.
+
+        Raises
+        ------
+        NoSystem
+            If it is not allowed.
+        """
         if p not in self._problems:
-            self._problems[p] = self._again(p)
+            try:
+                self._problems[p] = self._again(p)
+            except CaseError as e:
+                raise NoSystem(str(e)) from None
             while len(self._problems) > 4 * KEPT:
                 self._problems.pop(next(iter(self._problems)))
         return self._problems[p]
@@ -182,11 +192,11 @@ class Varied:
         """The scene at a value, on the mesh of the first one in its chart."""
         old, new = self._origin.problem, self.problem(p)
         if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
-            raise CaseError("the symmetry of the model changes on the way: give the case symmetry: none")
+            raise NoSystem("the symmetry of the model changes on the way: give the case symmetry: none")
         try:
             made = Scene(moved(self._origin, new), self._origin.comm)
         except MeshError as e:
-            raise CaseError(f"there is no mesh: {e}") from None
+            raise NoSystem(f"there is no mesh: {e}") from None
         return made
 
     def _state_in(self, base: Scene, p: float) -> State:
@@ -250,13 +260,13 @@ def moved(scene: Scene, new: Problem) -> Problem:
         knots = np.array([0.0, *old.meridian.circles, old.meridian.length])
         places = np.array([0.0, *new.meridian.circles, new.meridian.length])
         if knots.shape != places.shape:
-            raise CaseError("a rim of a dimple appears or vanishes on the way")
+            raise NoSystem("a rim of a dimple appears or vanishes on the way")
         return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))
     if scene.model.midsurface and not _alike(old.shape, new.shape):
         patch = scene.model.midsurface.reshaped(new.embedding)
         one, two = _box(old.shape), _box(new.shape)
         if one is None or two is None or patch.nodes.shape[1] != 2:
-            raise CaseError("the mesh of this shape cannot move with the number")
+            raise NoSystem("the mesh of this shape cannot move with the number")
         low, size = one[0], one[1] - one[0]
         stretched = two[0] + (patch.nodes - low) / size * (two[1] - two[0])
         return replace(made, shape=replace(patch, nodes=stretched), points=new.points)

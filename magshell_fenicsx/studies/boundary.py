@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label, Locus, Way
+from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label, Locus, NoSystem, Way
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -346,7 +346,7 @@ def _followed(
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
         varied = Varied(scene, record, partial(_problem, source, span, made), value, span.ends)
-    except CaseError as e:
+    except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     curve = Boundary(varied, varied.name, varied.kind, scales, own.recorded)
