@@ -170,7 +170,7 @@ def boundary(
         If the disk is full; solved points are kept.
     """
     span = parse_range(over)
-    source = from_first(comm, lambda: _source(Path(file), span, settings))
+    source = from_first(comm, lambda: read_source(Path(file), settings))
     folder, name = given_folder(out), Path(file).name
     with FOLDER.held(folder, comm, name):
         journal = partial(_Journal, folder / "points", _identity(source, span, made))
@@ -199,15 +199,6 @@ def boundary(
     for line in done.content["said"]:
         say(line)
     return done
-
-
-def _source(file: Path, span: Range, settings: Sequence[str]) -> Source:
-    source = read_source(file)
-    for setting in settings:
-        if setting.partition("=")[0].strip() == span.key:
-            raise CaseError(f"--set {setting}: this key varies by --over")
-        override(source, setting)
-    return source
 
 
 def _value(source: Source, span: Range, made: Made) -> float:
