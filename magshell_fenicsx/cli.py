@@ -173,6 +173,28 @@ def sweep(
 
 
 @app.command()
+def boundary(
+    case: CaseFile,
+    over: Annotated[
+        str, typer.Option(metavar="KEY=A:B", help="the key that varies, and its range; A:B:STEPS is finer")
+    ],
+    set_: Settings = None,
+    out: Annotated[str | None, folder_option("results/<case name>_boundary/")] = None,
+) -> None:
+    """Follow the fold or bifurcation at the end of a case in a second key, through cusps; keep points in the folder."""
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.simulate.record import Stopped
+    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+
+    folder = chosen_folder(out, f"{case.stem}_boundary")
+    with exit_codes(stopped=(DiskError, Stopped)):
+        done = follow_boundary(case, over, set_ or [], folder, made=_made)
+    print_line(f"results in {folder}/")
+    if done.stopped:
+        raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)
+
+
+@app.command()
 def study(
     case: CaseFile,
     over: Over,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 from warnings import warn
 
 from mpi4py import MPI
@@ -19,6 +19,9 @@ from magshell_fenicsx.simulate.follow import follow as follow_scene
 from magshell_fenicsx.simulate.follow import warned
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.studies.boundary import StabilityBoundary
 
 Given: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
@@ -95,6 +98,20 @@ def follow(
     problem = problem_of(given)
     home = problem.given and problem.given.home
     return follow_scene(Scene(problem, home.comm if home else MPI.COMM_WORLD), search=search, remark=remark)
+
+
+def boundary(
+    file: Path | str,
+    over: str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/boundary",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = lambda line: None,
+) -> "StabilityBoundary":
+    """Follow the instability at the end of a case file in a second key; see `studies.boundary.boundary`."""
+    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+
+    return follow_boundary(file, over, settings, out, comm, say, made=Case.from_source)
 
 
 def run(

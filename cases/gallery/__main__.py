@@ -20,12 +20,14 @@ WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such s
 FIRST = (
     "designed.png",
     "design.png",
+    "boundary.png",
     "ensemble.png",
     "solutions.png",
     "contact.png",
     "gradients.png",
     "shell.png",
 )  # that there is
+OVER = {"arch_boundary": "loading.0.factor=0.5:1.9"}  # cases of magshell boundary -> the key that varies
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
@@ -38,6 +40,8 @@ def row(file: Path) -> str:
     data = read_source(file).data
     kind = next((kind for kind in ("ensemble", "design") if kind in data), "run")
     more = ["--samples", "20", "--seed", "1"] if kind == "ensemble" else []
+    if over := OVER.get(file.stem):
+        kind, more = "boundary", ["--over", over]
     command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
     before = os.times()
     said = subprocess.run(

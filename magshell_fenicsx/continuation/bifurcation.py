@@ -132,10 +132,10 @@ def _step(system: System, state: State, name: str, tangent: AugmentedTangent) ->
     w_mu, pull = tangent.solve(system.load(u, state.mu, name))  # pull = v . R_mu
     cubic = third(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
-    mixed = _mixed(system, state, v, w_mu) - K_mu_v
-    turn, bend = dot(comm, mixed, v), dot(comm, v, _load_rate(system, state, name))
-    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn]]
-    rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, mixed, w_R)]
+    both = mixed(system, state, v, w_mu) - K_mu_v
+    turn, bend = dot(comm, both, v), dot(comm, v, _load_rate(system, state, name))
+    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, both, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn]]
+    rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, both, w_R)]
     dmu, alpha = np.linalg.solve(rows, rest)
     return alpha * v - w_R - dmu * w_mu, float(dmu), w_mu
 
@@ -147,7 +147,7 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
     return np.asarray((ahead - back) / (2 * d))
 
 
-def _mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
+def mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
     """Pi'''(v, w, .), by polarisation."""
     comm = system.comm
     size = max_abs(comm, w) / max_abs(comm, v)

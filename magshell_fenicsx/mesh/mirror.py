@@ -20,7 +20,7 @@ CUT = "symmetry"  # name of the edge on the plane
 ROUNDING = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mirror:
     """The plane normal . x = offset; the half with normal . x > offset is modelled.
 
@@ -35,6 +35,16 @@ class Mirror:
     normal: Array
     offset: float = 0.0
     lost: Mapping[str, str] = field(default_factory=dict)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether it is the same plane with the same edges: the parts of an array are compared one by one."""
+        if not isinstance(other, Mirror):
+            return NotImplemented
+        same = (self.offset, self.lost) == (other.offset, other.lost)
+        return same and np.array_equal(self.normal, other.normal)
+
+    def __hash__(self) -> int:
+        return hash((*self.normal, self.offset))
 
     @classmethod
     def of(cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None) -> "Mirror":

@@ -1,0 +1,512 @@
+"""The boundary of stability: a fold or a bifurcation followed in a second number p, through turning points.
+
+A fold is R(u, mu, p) = 0 and g(u, mu, p) = 0, a bifurcation R + beta b = 0, g = 0 and v . R_mu = 0, with g and v of
+`fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. With p unknown too, both are curves, which are followed by arc
+length in (u, mu, p) (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 3 and 4). A
+Newton step takes one factorisation and a back-solve for each of R, R_mu and R_p.
+
+Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at
+which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from scipy.interpolate import barycentric_interpolate
+
+from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
+from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
+from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, third, times_tangent
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
+
+Kind = Literal["fold", "bifurcation"]
+Label = Literal["start", "point", "cusp", "turn", "meeting", "end"]
+TOLERANCE = 1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
+LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
+MOST_ITERATIONS = 8
+LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
+EASY = 2  # iterations after which a step grows
+MOST_TURN, STRAIGHT = 0.6, 0.95  # cosines of successive tangents: less is refused; with more, steps grow
+GAP = 0.5  # of a step: a larger correction of its prediction counts as a jump
+ALIKE = 0.5  # cosine of successive null vectors
+SMALLEST = 1e-4  # of the first step
+SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
+MOST_TRIALS, MOST_POINTS = 12, 400
+MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
+SYMMETRIC = 1e-4  # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
+ROUNDING = 1e-12  # relative, of an amplitude
+SOLVES = 25  # of the power iteration for a second eigenvalue near zero
+
+
+class Family(Protocol):
+    """Systems that differ by a number p, with the same unknowns."""
+
+    def at(self, p: float) -> BorderedNewton:
+        """The solver of the system at p; it may raise `NoSystem`."""
+
+    def amplitudes(self, p: float) -> dict[str, float]:
+        """The amplitudes beside the one that is unknown."""
+
+    def beside(self, p: float) -> Sequence[tuple[float, float]]:
+        """Weights and values of p of a difference: the derivative by p is the weighted sum of what is there."""
+
+
+class NoSystem(RuntimeError):
+    """There is no system at this value of p; the message gives the reason."""
+
+
+class BoundaryLost(RuntimeError):
+    """The boundary could not be followed further; the message gives the reason."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A direction (du, dmu, dp)."""
+
+    du: Vector = field(repr=False)
+    dmu: float
+    dp: float
+
+
+@dataclass(frozen=True)
+class Locus:
+    """A point of a boundary.
+
+    Attributes
+    ----------
+    phi
+        Null vector of K, of length one, the same way along the whole boundary.
+    unstable
+        Number of unstable directions besides `phi`.
+    way
+        Tangent of the boundary, of length one.
+    cubic, pull
+        phi . Pi'''(phi, phi) and phi . R_mu.
+    second
+        The eigenvalue nearest to zero besides that of `phi`, where it was asked for; else NaN.
+    load_error
+        Estimated error of the amplitude.
+    """
+
+    p: float
+    state: State
+    phi: Vector = field(repr=False)
+    unstable: int
+    way: Way
+    cubic: float
+    pull: float
+    second: float
+    load_error: float
+    factorisations: int
+
+
+@dataclass(frozen=True)
+class _Row:
+    """g + c . (du, dmu, dp) = 0, the row that says where on the curve a point is."""
+
+    du: Vector | None
+    dmu: float
+    dp: float
+    value: Callable[[Vector, float, float], float]
+
+
+class Boundary:
+    """A boundary in the plane of an amplitude and of p.
+
+    Parameters
+    ----------
+    name
+        The amplitude that is unknown.
+    scales
+        Of the amplitude and of p: changes that count as of order one in the arc length.
+    recorded
+        Gets each solve, and gives its result or that of an interrupted boundary at this place.
+    """
+
+    def __init__(
+        self,
+        family: Family,
+        name: str,
+        kind: Kind,
+        scales: tuple[float, float],
+        recorded: "Callable[[Callable[[], Locus | str]], Locus | str]" = lambda solve: solve(),
+    ) -> None:
+        self.family, self.name, self.kind, self.scales = family, name, kind, scales
+        self._recorded = recorded
+        self._weight = 0.0
+
+    def inner(self, a: Way, b: Way) -> float:
+        """<a, b>: root mean square of u over the length, and the numbers over their scales."""
+        mu, p = self.scales
+        return self._weight * dot(self._comm, a.du, b.du) + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
+
+    def start(self, p: float, state: State, phi: Vector) -> Locus:
+        """The point at p near an instability that a path has located.
+
+        Raises
+        ------
+        BoundaryLost
+            If none is found.
+        """
+        system = self.family.at(p).system
+        self._comm, self._length = system.comm, system.length
+        self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
+        if self.family.at(p).factor_at(state).skewed:
+            raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
+        found = self._solved(p, state, phi, _Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
+        if isinstance(found, str):
+            raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {found}")
+        return found
+
+    def followed(
+        self, start: Locus, sense: float, ends: tuple[float, float], steps: int
+    ) -> Iterator[tuple[Label, Locus]]:
+        """Points from a start until p leaves its range.
+
+        Parameters
+        ----------
+        sense
+            Sign of dp at the start.
+        steps
+            No step changes p by more than its scale over this number.
+
+        Raises
+        ------
+        BoundaryLost
+            If the smallest step fails.
+        """
+        here = start if start.way.dp * sense >= 0 else _turned(start)
+        before: tuple[Locus, float] | None = None  # the point before, and the step from it
+        most = self.scales[1] / steps
+        length = first = min(most / max(abs(here.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5)
+        for _ in range(MOST_POINTS):
+            guess = self._ahead(before, here, length)
+            if not ends[0] < guess.dp < ends[1]:
+                last = self._last(before, here, length, ends)
+                if last:
+                    yield from self._between(here, *last)
+                    yield "end", last[0]
+                    return
+            found = "the end of the range is not reached at once"
+            if ends[0] < guess.dp < ends[1]:
+                found = self._at_distance(here, guess, length)
+            if isinstance(found, str):
+                length /= 2
+                if length < SMALLEST * first:
+                    raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {found}")
+                continue
+            yield from self._between(here, found, length)
+            if not ends[0] < found.p < ends[1]:  # the prediction had not shown it
+                length /= 2
+                continue
+            yield "point", found
+            straight = self.inner(here.way, found.way) > STRAIGHT
+            step, before, here = length, (here, length), found
+            if found.factorisations <= EASY and straight:
+                length = 1.5 * length
+            elif found.factorisations > 2 * EASY:
+                length = 0.7 * length
+            length = min(length, 1.2 * most / max(abs(here.way.dp), 1e-300), 3 * first, 2 * step)
+        raise BoundaryLost(f"{MOST_POINTS} points have not reached the end of the range")
+
+    def _between(self, low: Locus, high: Locus, length: float) -> Iterator[tuple[Label, Locus]]:
+        """What is special between two successive points."""
+        if low.way.dp * high.way.dp < 0:
+            turn = self._stationary(low, high, length)
+            is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
+            yield "cusp" if is_cusp else "turn", turn
+        if low.unstable != high.unstable and (met := self._meeting(low, high, length)):
+            yield "meeting", met
+
+    def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
+        """The point after a step: by the cubic through the last two points and their tangents."""
+        if before is None:
+            return self._plus(here, length, here.way)
+        low, step = before
+        return self._hermite(low, here, step, 1 + length * self.inner(low.way, here.way) / step)
+
+    def _plus(self, here: Locus, t: float, way: Way) -> Way:
+        mu = here.state.mu[self.name]
+        return Way(here.state.u + t * way.du, mu + t * way.dmu, here.p + t * way.dp)
+
+    def _hermite(self, low: Locus, high: Locus, step: float, t: float) -> Way:
+        """The cubic at t in units of the step, which is measured along the tangent at the low end."""
+        faster = 1 / self.inner(low.way, high.way)
+        h00, h10 = (1 + 2 * t) * (1 - t) ** 2, t * (1 - t) ** 2
+        h01, h11 = t**2 * (3 - 2 * t), t**2 * (t - 1)
+        a, b, name = step * h10, step * faster * h11, self.name
+
+        def at(x0: float, d0: float, x1: float, d1: float) -> float:
+            return h00 * x0 + a * d0 + h01 * x1 + b * d1
+
+        return Way(
+            h00 * low.state.u + a * low.way.du + h01 * high.state.u + b * high.way.du,
+            at(low.state.mu[name], low.way.dmu, high.state.mu[name], high.way.dmu),
+            at(low.p, low.way.dp, high.p, high.way.dp),
+        )
+
+    def _at_distance(self, base: Locus, guess: Way, length: float, *, look: bool = False) -> Locus | str:
+        """The point at a distance along the tangent of another one."""
+        way, (mu, p), name = base.way, self.scales, self.name
+
+        def value(u: Vector, m: float, q: float) -> float:
+            return self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
+
+        row = _Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
+        found = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look)
+        if isinstance(found, str):
+            return found
+        off = Way(found.state.u - guess.du, found.state.mu[name] - guess.dmu, found.p - guess.dp)
+        if np.sqrt(self.inner(off, off)) > GAP * abs(length):
+            return "a step ends far from its prediction"
+        if self.inner(way, found.way) < MOST_TURN:
+            return "the boundary turns too sharply"
+        return found
+
+    def _last(
+        self, before: tuple[Locus, float] | None, here: Locus, length: float, ends: tuple[float, float]
+    ) -> tuple[Locus, float] | None:
+        """The point at the end of the range, and its distance; None if the boundary does not go there at once."""
+        low, high = 0.0, length
+        for _ in range(50):  # where the prediction leaves the range
+            middle = (low + high) / 2
+            inside = ends[0] < self._ahead(before, here, middle).dp < ends[1]
+            low, high = (middle, high) if inside else (low, middle)
+        guess = self._ahead(before, here, high)
+        end = float(min(ends, key=lambda end: abs(end - guess.dp)))
+        row = _Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
+        found = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
+        if isinstance(found, str) or found.way.dp * here.way.dp < 0 or self.inner(found.way, here.way) < MOST_TURN:
+            return None
+        off = Way(found.state.u - guess.du, found.state.mu[self.name] - guess.dmu, 0.0)
+        return None if np.sqrt(self.inner(off, off)) > GAP * high else (found, high)
+
+    def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
+        """Where p turns between two points: the stationary point of the cubic through both, repeated."""
+        base, a, b = low, 0.0, length  # distances along the tangent of the base
+        best = min(low, high, key=lambda one: abs(one.way.dp))
+        for _ in range(MOST_TRIALS):
+            s = _zero_of_slope(a, low, b, high, base, self)
+            guess = self._hermite(low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a))
+            found = self._at_distance(base, guess, s)
+            if isinstance(found, str):  # rounding: the cubic is as good
+                state = best.state.with_(guess.du, self.name, float(guess.dmu))
+                return replace(best, p=float(guess.dp), state=state)
+            best = found if abs(found.way.dp) < abs(best.way.dp) else best
+            other, gap = (high, b - s) if found.way.dp * low.way.dp > 0 else (low, s - a)
+            curvature = abs(other.way.dp - found.way.dp) / gap
+            rest = found.way.dp**2 / (2 * curvature) if curvature else 0.0
+            if rest <= SPECIAL * self.scales[1] or min(s - a, b - s) < 1e-9 * length:
+                break
+            low, high, a, b = (found, high, s, b) if found.way.dp * low.way.dp > 0 else (low, found, a, s)
+        return best
+
+    def _meeting(self, low: Locus, high: Locus, length: float) -> Locus | None:
+        """Where a second eigenvalue is zero between two points, by inverse interpolation.
+
+        The bordered tangent is singular there, so the point itself is interpolated between others close by.
+        """
+        known, a, b = list[tuple[float, float, Locus]](), 0.0, length
+        s = length / 2
+        while len(known) < MOST_LOOKS:
+            tried = self._at_distance(low, self._hermite(low, high, length, s / length), s, look=True)
+            if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in known):
+                break
+            known = sorted([*known, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
+            a, b = (s, b) if tried.unstable == low.unstable else (a, s)
+            s = (a + b) / 2
+            if len(known) > 1:
+                ahead = _interpolated([each[1] for each in known], [each[0] for each in known], 0.0)
+                s = ahead if a < ahead < b else s
+                if abs(s - known[0][0]) < CLOSE * length:
+                    break
+        if len(known) < 2:
+            return known[0][2] if known else None
+        places, mu = [each[0] for each in known], self.name
+        found, loads = known[0][2], [each[2].state.mu[mu] for each in known]
+        p, load = _interpolated(places, [each[2].p for each in known], s), _interpolated(places, loads, s)
+        error = abs(load - _interpolated(places[:-1], loads[:-1], s))
+        return replace(found, p=p, state=found.state.with_(found.state.u, mu, load), load_error=error)
+
+    def _solved(
+        self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool = False
+    ) -> Locus | str:
+        """The point near a guess on which a row holds, or the reason why there is none."""
+        return self._recorded(lambda: self._by_newton(p, state, b, row, near, look=look))
+
+    def _by_newton(
+        self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool
+    ) -> Locus | str:
+        try:
+            return self._iterated(float(p), state, b, row, near, look=look)
+        except NoSystem as e:
+            return str(e)
+
+    def _iterated(self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool) -> Locus | str:
+        u, mu, name = state.u, float(state.mu[self.name]), self.name
+        beside = self.family.beside(p)
+        sizes, changes = list[float](), list[float]()
+        while True:
+            newton = self.family.at(p)
+            system, here = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
+            try:
+                tangent = AugmentedTangent(newton, here, b)
+                lines = _Lines(system, here, name, tangent, self.family, beside, self.scales)
+                way = lines.step(self.kind, row, row.value(u, mu, p))
+            except np.linalg.LinAlgError:
+                return "the tangent is singular in more than one direction"
+            b = tangent.v
+            sizes.append(max_abs(system.comm, way.du) / system.length)
+            changes.append(abs(way.dmu))
+            if not (sizes[-1] <= LARGEST_STEP and np.isfinite(way.dmu + way.dp)):
+                return "Newton's method diverges"
+            if len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], TOLERANCE):
+                return "Newton's method diverges"
+            u, mu, p = u + way.du, float(mu + way.dmu), float(p + way.dp)
+            rate = min(sizes[-1] / sizes[-2], 0.5) if len(sizes) > 1 and sizes[-2] else 0.5
+            rest = rate / (1 - rate)
+            slow = sizes[-1] > sizes[-2] / 2 if len(sizes) > 1 else False
+            settled = sizes[-1] * rest <= TOLERANCE or (slow and sizes[-1] <= TOLERANCE)
+            if settled and (changes[-1] * rest <= LOAD_TOLERANCE * self.scales[0] or slow):
+                break
+            if len(sizes) == MOST_ITERATIONS:
+                return f"Newton's method has not converged in {MOST_ITERATIONS} iterations"
+        last = self.family.at(p).system
+        lines.balance(last.residual(u, {**self.family.amplitudes(p), name: mu}))
+        rest_of = lines.step(self.kind, row, row.value(u, mu, p), settled=True)
+        u, mu, p = u + rest_of.du, float(mu + rest_of.dmu), float(p + rest_of.dp)
+        v = b / np.sqrt(dot(system.comm, b, b))
+        if near is not None:
+            cosine = dot(system.comm, v, near.phi)
+            if abs(cosine) < ALIKE:
+                return "the null vector is another one"
+            v = v * np.sign(cosine)
+        direction = lines.step(self.kind, row, None)
+        norm = np.sqrt(self.inner(direction, direction))
+        if near is not None and self.inner(direction, near.way) < 0:
+            norm = -norm
+        scale = dot(system.comm, tangent.v, v)
+        return Locus(
+            p=p,
+            state=State(u, {**self.family.amplitudes(p), name: mu}),
+            phi=np.asarray(v),
+            unstable=tangent.unstable,
+            way=Way(direction.du / norm, direction.dmu / norm, direction.dp / norm),
+            cubic=dot(system.comm, lines.cubic, tangent.v) / scale**3,
+            pull=lines.t_mu / scale,
+            second=_second(tangent, system) if look else np.nan,
+            load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
+            factorisations=len(sizes),
+        )
+
+
+class _Lines:
+    """The rows of Newton's step at a state, with what its columns take: du = alpha v - w_R - dmu w_mu - dp w_p."""
+
+    def __init__(
+        self,
+        system: System,
+        state: State,
+        name: str,
+        tangent: AugmentedTangent,
+        family: Family,
+        beside: Sequence[tuple[float, float]],
+        scales: tuple[float, float],
+    ) -> None:
+        self._scales, self._largest = scales, 0.0
+        self._system, self._state, self._name, self._tangent = system, state, name, tangent
+        own = {name: state.mu[name]}
+        self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
+        v, u = tangent.v, state.u
+        self.w_R, self.t_R = tangent.solve(system.residual(u, state.mu))
+        self._R_mu = system.load(u, state.mu, name)
+        self.w_mu, self.t_mu = tangent.solve(self._R_mu)
+        self.w_p, self.t_p = tangent.solve(self._by_p(lambda other, mu: other.residual(u, mu)))
+        self.cubic = third(system, state, v)
+        self.K_mu_v = first_difference(lambda x: system.load(x, state.mu, name), system, u, v)
+        self.K_p_v = self._by_p(lambda other, mu: times_tangent(other, State(u, mu), v))
+
+    def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
+        """The derivative by p at fixed u and amplitude."""
+        return np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0)
+
+    def balance(self, residual: Vector) -> None:
+        """Take the residual at a state close by, with the same factors."""
+        self.w_R, self.t_R = self._tangent.solve(residual)
+
+    def step(self, kind: Kind, row: _Row, value: float | None, *, settled: bool = False) -> Way:
+        """Newton's step to the point on which a row has the value zero; without a value the tangent of the curve.
+
+        `settled` takes only the residual and the row as not yet zero.
+        """
+        comm, v, t = self._system.comm, self._tangent.v, self._tangent
+        w_R, t_R = (self.w_R, self.t_R) if value is not None else (0.0 * v, 0.0)
+        g, pull = (t.g, self.t_mu) if value is not None and not settled else (0.0, 0.0)
+
+        def along(c: Vector) -> list[float]:
+            """What c . du has of dmu, dp, alpha and of R."""
+            return [-dot(comm, c, self.w_mu), -dot(comm, c, self.w_p), dot(comm, c, v), -dot(comm, c, w_R)]
+
+        on_v, on_mu = along(self.cubic), dot(comm, v, self.K_mu_v)
+        singular = [on_v[0] + on_mu, on_v[1] + dot(comm, v, self.K_p_v), on_v[2], on_v[3] - g]
+        own = [self.t_mu, self.t_p, -t.g, t_R] if kind == "fold" else self._without_work(along, pull)
+        c = along(row.du) if row.du is not None else [0.0] * 4
+        place = [c[0] + row.dmu, c[1] + row.dp, c[2], c[3] + value if value is not None else -1.0]
+        rows = np.array([singular, own, place])
+        columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
+        rows[:, :3] *= columns
+        size = np.abs(rows[:, :3]).max(axis=1)
+        if kind == "bifurcation":
+            size[1] = max(size[1], self._largest * columns[2])
+        rows /= np.where(size, size, 1.0)[:, None]
+        dmu, dp, alpha = columns * np.linalg.lstsq(rows[:, :3], -rows[:, 3], SYMMETRIC if kind != "fold" else None)[0]
+        return Way(alpha * v - w_R - dmu * self.w_mu - dp * self.w_p, float(dmu), float(dp))
+
+    def _without_work(self, along: Callable[[Vector], list[float]], pull: float) -> list[float]:
+        """The row v . R_mu = 0, with v' = -K^-1 K' v."""
+        system, state, name, comm = self._system, self._state, self._name, self._system.comm
+        v, w = self._tangent.v, self.w_mu
+        mixed = mixed_third(system, state, v, w) - self.K_mu_v
+        self._largest = dot(comm, np.abs(mixed), np.abs(v))
+        mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
+        ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
+        by_mu = dot(comm, v, (ahead - back) / (2 * d)) - dot(comm, w, self.K_mu_v)
+        load_p = self._by_p(lambda other, amplitudes: other.load(state.u, amplitudes, name))
+        by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)
+        c = along(mixed)
+        return [by_mu - c[0], by_p - c[1], -c[2], pull - c[3]]
+
+
+def _second(tangent: AugmentedTangent, system: System) -> float:
+    """The eigenvalue of K nearest to zero across b, by a power iteration of the bordered inverse."""
+    x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)
+    value = np.nan
+    for _ in range(SOLVES):
+        y, _ = tangent.solve(x)
+        value = dot(system.comm, x, x) / dot(system.comm, x, y)
+        x = y / np.sqrt(dot(system.comm, y, y))
+    return float(value)
+
+
+def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
+    """The polynomial through some points."""
+    return float(barycentric_interpolate(x, y, at))
+
+
+def _turned(locus: Locus) -> Locus:
+    """The same point with the opposite tangent."""
+    return replace(locus, way=Way(-locus.way.du, -locus.way.dmu, -locus.way.dp))
+
+
+def _zero_of_slope(a: float, low: Locus, b: float, high: Locus, base: Locus, boundary: Boundary) -> float:
+    """Where the Hermite cubic of p over the distance along the base's tangent is stationary."""
+    L = b - a
+    d0, d1 = (one.way.dp / boundary.inner(base.way, one.way) for one in (low, high))
+    rise = (high.p - low.p) / L
+    roots = np.roots([3 * (d0 + d1 - 2 * rise), 2 * (3 * rise - 2 * d0 - d1), d0])
+    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
+    t = inside[0] if inside else d0 / (d0 - d1)
+    return a + L * min(max(t, 1e-3), 1 - 1e-3)

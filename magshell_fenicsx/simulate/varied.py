@@ -1,0 +1,287 @@
+"""A scene in one number of its case: the systems of `continuation.boundary`, and the instability where it starts.
+
+A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays in one scene. Every
+other one has a scene for each value, on the same mesh in the chart; where the chart changes its size, the mesh with it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from math import isclose
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.boundary import NoSystem
+from magshell_fenicsx.continuation.fold import times_tangent
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State, Vector, max_abs
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.problem.columns import own_amplitudes
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import stage_at
+from magshell_fenicsx.simulate.stage import Stage
+from magshell_fenicsx.simulate.steps import LOCATED
+from magshell_fenicsx.simulate.transfer import chart, transfer
+
+Array = NDArray[np.float64]
+Again = Callable[[float], Problem]
+STEP = 1e-4  # of the range: of differences by p
+ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
+SAME = 1e-10  # relative differences of forces that are rounding
+KEPT = 8  # scenes
+
+
+class NoInfluence(CaseError):
+    """The number changes nothing at the instability."""
+
+
+def instability(records: Sequence[Record]) -> Record:
+    """The first instability of a history's last step, which ends its case.
+
+    Raises
+    ------
+    CaseError
+        If there is none.
+    """
+    own = [record for record in records if not record.branch]
+    located = [record for record in own if record.label in LOCATED and record.step == own[-1].step]
+    if not located:
+        raise CaseError(
+            "the case ends without an instability, and a boundary is that of a fold or a bifurcation: give its last "
+            "step until: limit, and a load that reaches one"
+        )
+    return located[0]
+
+
+class Varied:
+    """A `continuation.boundary.Family` of scenes.
+
+    Parameters
+    ----------
+    scene, record
+        The scene at `value`, and its instability.
+    again
+        Makes the problem at a value.
+    ends
+        The range of values.
+
+    Attributes
+    ----------
+    kind, name
+        Of the instability, and the amplitude in which it is.
+    mode
+        As of the record.
+    alone
+        Whether only amplitudes depend on the number.
+
+    Raises
+    ------
+    CaseError
+        If the number has no influence, or the instability cannot be followed.
+    """
+
+    def __init__(self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]) -> None:
+        self.kind: Literal["fold", "bifurcation"] = "fold" if record.label == "fold" else "bifurcation"
+        self.name, self.mode = record.amplitude, record.mode
+        self._again, self._ends, self._record = again, ends, record
+        self._problems: dict[float, Problem] = {}
+        self._stages: dict[float, Stage] = {}
+        self._refuse_unknown(scene)
+        self._origin, self.alone = scene, False
+        self._nodes = chart(self._scene(value))
+        self._value, base = value, self._scene(value)
+        self._first = replace(record, point=replace(record.point, state=self._state_in(base, value)))
+        self._stages[value] = self._base = stage_at(base, self._first)
+        self.alone = self._by_amplitudes_alone(value)
+
+    def _refuse_unknown(self, scene: Scene) -> None:
+        record, programme = self._record, scene.problem.programme
+        if record.mode.startswith("m = ") or record.mode == "antisymmetric":
+            raise CaseError(f"the instability is one that the model excludes ({record.mode}): take symmetry: none")
+        earlier = programme[: record.step - 1]
+        step = programme[record.step - 1]
+        if earlier and any(how != "load" for how in step.load.hold.values()):
+            raise CaseError(f"{step.key}.hold: a boundary needs what is held to be held from the start: give one step")
+        for each in earlier:
+            target = each.load.target
+            if each.load.hold or (target and target[0].quantity == "conjugate"):
+                raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
+
+    def start(self) -> tuple[State, Vector]:
+        """The instability in the unknowns of the family, and a null vector.
+
+        Raises
+        ------
+        CaseError
+            If there is no eigenvector.
+        """
+        state = self._base.enter(self._first.point.state)
+        try:
+            return state, critical_mode(self._base.newton, state).vector
+        except NoEigenpair as e:
+            raise CaseError(f"the instability has no null vector: {e}") from None
+
+    def at(self, p: float) -> BorderedNewton:
+        """The solver at a value."""
+        return self._base.newton if self.alone else self._stage(p).newton
+
+    def amplitudes(self, p: float) -> dict[str, float]:
+        """The amplitudes beside that of the instability."""
+        stage = self._base if self.alone else self._stage(p)
+        mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
+        return {name: v for name, v in mu.items() if name != self.name}
+
+    def beside(self, p: float) -> list[tuple[float, float]]:
+        """Weights and values of a difference of second order, on the side where values are allowed."""
+        d = STEP * abs(self._ends[1] - self._ends[0])
+        try:
+            for q in (p - d, p + d):
+                self.problem(q)
+        except NoSystem:
+            sign = 1.0
+            try:
+                self.problem(p + 2 * d)
+            except NoSystem:
+                sign = -1.0
+            return [(-1.5 * sign / d, p), (2 * sign / d, p + sign * d), (-0.5 * sign / d, p + 2 * sign * d)]
+        return [(0.5 / d, p + d), (-0.5 / d, p - d)]
+
+    def left(self, p: float, state: State) -> State:
+        """A state of the family as one of the model."""
+        return (self._base if self.alone else self._stage(p)).leave(state)
+
+    def scene(self, p: float) -> Scene:
+        """The scene at a value; where only amplitudes depend on it, the one of all."""
+        return (self._base if self.alone else self._stage(p)).scene
+
+    def problem(self, p: float) -> Problem:
+        """The problem at a value.
+
+        Raises
+        ------
+        NoSystem
+            If it is not allowed.
+        """
+        if p not in self._problems:
+            try:
+                self._problems[p] = self._again(p)
+            except CaseError as e:
+                raise NoSystem(str(e)) from None
+            while len(self._problems) > 4 * KEPT:
+                self._problems.pop(next(iter(self._problems)))
+        return self._problems[p]
+
+    def _stage(self, p: float) -> Stage:
+        found = self._stages.pop(p, None)
+        if found is None:
+            scene = self._scene(p)
+            found = self._base.on(scene) if self._base.device or self._base.along else Stage(scene, scene.newton)
+        self._stages[p] = found
+        while len(self._stages) > KEPT:
+            self._stages.pop(next(iter(self._stages)))
+        return found
+
+    def _scene(self, p: float) -> Scene:
+        """The scene at a value, on the mesh of the first one in its chart."""
+        old, new = self._origin.problem, self.problem(p)
+        if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
+            raise NoSystem("the symmetry of the model changes on the way: give the case symmetry: none")
+        try:
+            made = Scene(moved(self._origin, new), self._origin.comm)
+        except MeshError as e:
+            raise NoSystem(f"there is no mesh: {e}") from None
+        return made
+
+    def _state_in(self, base: Scene, p: float) -> State:
+        """The record's state in the unknowns of the family, which may be in another order."""
+        state = self._record.point.state
+        return State(transfer(self._origin, base, state.u), self._mu(p))
+
+    def _mu(self, p: float) -> dict[str, float]:
+        """The amplitudes of the model at the instability, those that are given being those of another problem."""
+        old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
+        for before, after in zip(old.programme[: self._record.step - 1], new.programme, strict=False):
+            one, two = before.load.target, after.load.target
+            if one and two and one[0].quantity == "load" and isclose(mu.get(before.name, np.nan), one[1], rel_tol=1e-9):
+                mu[before.name] = two[1]
+        given, now = own_amplitudes(old.loads), own_amplitudes(new.loads)
+        mu |= {name: now[name] for name, v in given.items() if name in now and v and mu.get(name) == v}
+        if old.lambda_m and new.lambda_m != old.lambda_m:
+            ratio = new.lambda_m / old.lambda_m
+            mu |= {name: ratio * v for name, v in mu.items() if name.startswith("lambda_") and name != self.name}
+        return mu
+
+    def _by_amplitudes_alone(self, value: float) -> bool:
+        """Whether the forces of another value are those of other amplitudes in the same scene.
+
+        Raises
+        ------
+        NoInfluence
+            If they are the same.
+        """
+        low, high = self._ends
+        other = value + ASIDE * (high - low) if value + ASIDE * (high - low) <= high else value - ASIDE * (high - low)
+        (state, phi), comm = self.start(), self._origin.model.system.comm
+        own = {self.name: state.mu[self.name]}
+
+        def forces(stage: Stage, p: float) -> Vector:
+            system, mu = stage.newton.system, {**self._fixed(stage, p), **own}
+            along = times_tangent(system, State(state.u, mu), phi)
+            return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
+
+        self._stages[other] = stage = self._stage(other)
+        here, there, moved_only = forces(self._base, value), forces(stage, other), forces(self._base, other)
+        size = max_abs(comm, here) or 1.0
+        if max_abs(comm, there - here) <= SAME * size:
+            raise NoInfluence("it has no influence on this instability")
+        return max_abs(comm, there - moved_only) <= SAME * size
+
+    def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
+        mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
+        return {name: v for name, v in mu.items() if name != self.name}
+
+
+def moved(scene: Scene, new: Problem) -> Problem:
+    """A problem on the mesh of a scene, which is stretched with the chart."""
+    made, old = on_mesh_of(scene, new), scene.problem
+    if scene.model.axisymmetric:
+        assert old.meridian
+        assert new.meridian
+        assert made.meridian
+        vertices = made.meridian.vertices
+        assert vertices is not None
+        knots = np.array([0.0, *old.meridian.circles, old.meridian.length])
+        places = np.array([0.0, *new.meridian.circles, new.meridian.length])
+        if knots.shape != places.shape:
+            raise NoSystem("a rim of a dimple appears or vanishes on the way")
+        return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))
+    if scene.model.midsurface and not _alike(old.shape, new.shape):
+        patch = scene.model.midsurface.reshaped(new.embedding)
+        one, two = _box(old.shape), _box(new.shape)
+        if one is None or two is None or patch.nodes.shape[1] != 2:
+            raise NoSystem("the mesh of this shape cannot move with the number")
+        low, size = one[0], one[1] - one[0]
+        stretched = two[0] + (patch.nodes - low) / size * (two[1] - two[0])
+        return replace(made, shape=replace(patch, nodes=stretched), points=new.points)
+    return made
+
+
+def _alike(one: object, two: object) -> bool:
+    a, b = _box(one), _box(two)
+    return a is None or b is None or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
+
+
+def _box(shape: object) -> tuple[Array, Array] | None:
+    """Bounds of the chart."""
+    if isinstance(shape, Grid):
+        return np.array(shape.low), np.array(shape.high)
+    box: tuple[Array, Array] | None = getattr(shape, "box", None)
+    radius = getattr(shape, "radius", None)
+    return (np.zeros(2), np.full(2, radius)) if radius is not None else box

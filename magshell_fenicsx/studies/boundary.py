@@ -1,0 +1,415 @@
+"""The boundary of stability of a case: its instability followed in a second key, with cusps, as table and picture."""
+
+import base64
+import copy
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label, Locus, NoSystem, Way
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.input.section import in_unit, number_and_unit
+from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.problem.columns import sizes_in_units
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.varied import Varied, instability
+from magshell_fenicsx.studies.boundary_picture import draw_boundary
+from magshell_fenicsx.studies.points import value_at
+from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
+
+FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
+FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
+COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
+ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "output")
+STEPS, MOST_STEPS = 20, 1000
+ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+SPECIAL = ("cusp", "turn", "meeting")
+SAID = {
+    "cusp": "a cusp, where two folds are born",
+    "turn": "the boundary turns: two instabilities meet there",
+    "meeting": "a second mode is neutral",
+}
+
+
+@dataclass(frozen=True)
+class Range:
+    """The key that varies, from its first to its last value in a unit, and the least number of steps between these."""
+
+    key: str
+    first: float
+    last: float
+    unit: str
+    steps: int
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """In rising order."""
+        return min(self.first, self.last), max(self.first, self.last)
+
+    def text(self, value: float) -> str:
+        """A value as in the case file."""
+        return f"{float(value)!r} {self.unit}".rstrip()
+
+
+def parse_range(text: str) -> Range:
+    """Read `--over`.
+
+    Raises
+    ------
+    CaseError
+        If it has another form, or is no range.
+
+    Examples
+    --------
+    >>> parse_range("magnetic.applied.flux_density=-40mT:0.04T")
+    Range(key='magnetic.applied.flux_density', first=-40.0, last=40.0, unit='mT', steps=20)
+    >>> parse_range("foundation.stiffness=0:1e-3:40").steps
+    40
+    """
+    key, _, values = text.partition("=")
+    parts = values.split(":")
+    try:
+        if not re.fullmatch(r"\w+(\.\w+)*", key) or len(parts) not in (2, 3):
+            raise ValueError
+        unit = number_and_unit(parts[0])[1] or number_and_unit(parts[1])[1]
+        first, last = (in_unit(part, unit) for part in parts[:2])
+        steps = int(parts[2]) if len(parts) == 3 else STEPS
+    except ValueError:
+        raise CaseError(f"--over {text}: {FORMS}") from None
+    if not np.isfinite([first, last]).all() or first == last:
+        raise CaseError(f"--over {text}: first and last must be two different finite numbers")
+    if not 1 <= steps <= MOST_STEPS:
+        raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
+    if key.split(".")[0] in ELSEWHERE:
+        raise CaseError(
+            f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has no boundary"
+        )
+    return Range(key, first, last, unit, steps)
+
+
+@dataclass(frozen=True)
+class StabilityBoundary:
+    """A finished boundary.
+
+    Attributes
+    ----------
+    rows
+        As in boundary.csv, from one end of the boundary to the other.
+    content
+        As in boundary.json.
+    """
+
+    rows: list[dict[str, Any]]
+    content: dict[str, Any]
+
+    @property
+    def special(self) -> list[dict[str, Any]]:
+        """The cusps, turning points and meetings among the rows."""
+        return [row for row in self.rows if row["kind"] in SPECIAL]
+
+    @property
+    def stopped(self) -> list[str]:
+        """Why the boundary ends before the range does."""
+        return list(self.content["stopped"])
+
+
+def boundary(
+    file: Path | str,
+    over: str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/boundary",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+    *,
+    made: Made,
+) -> StabilityBoundary:
+    """Follow the instability at the end of a case in a second key; collective, two ranks work.
+
+    The case is run once. From its instability both directions are followed, through turning points, until the key
+    leaves its range; what the folder has of an interrupted boundary is kept. See `continuation.boundary`.
+
+    Parameters
+    ----------
+    over
+        `key.path=first:last`, or with the least number of steps from the one to the other: `first:last:steps`.
+    out
+        Folder of boundary.csv, boundary.json, boundary.png and points/.
+    made
+        Makes a case of its source.
+
+    Raises
+    ------
+    CaseError
+        If the case or an end of the range is invalid, the case ends without an instability, or the key has no
+        influence on it or changes what a boundary cannot follow.
+    Stopped
+        If the path to the instability is lost.
+    DiskError
+        If the disk is full; solved points are kept.
+    """
+    span = parse_range(over)
+    source = from_first(comm, lambda: read_source(Path(file), settings))
+    folder, name = given_folder(out), Path(file).name
+    with FOLDER.held(folder, comm, name):
+        journal = partial(_Journal, folder / "points", _identity(source, span, made))
+        value = _value(source, span, made)
+        begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say))
+        if begin["mode"] == "antisymmetric":
+            say("the instability is antisymmetric: the whole shell is modelled")
+            override(source, "symmetry=none")
+            begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say))
+        if not begin["label"]:
+            instability([])
+        say(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
+        senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
+
+        def followed(sense: int) -> Iterator[str]:
+            own = journal("down" if sense < 0 else "up")
+            if not own.outcome:
+                own.finish(_followed(source, span, value, sense, made, begin, own, say))
+            rows = own.outcome["rows"]
+            yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
+
+        compute(senses, followed, comm, say)
+        found = by_first(comm, lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses})
+        done = _put_together(found, begin, span, name, settings)
+        by_first(comm, lambda: _write(done, folder))
+    for line in done.content["said"]:
+        say(line)
+    return done
+
+
+def _value(source: Source, span: Range, made: Made) -> float:
+    """Where the boundary starts: the case's own value, or the end of the range that is nearest to it."""
+    words = span.key.split(".")
+    raw = value_at(source.data, words)
+    raw = value_at(made(source).model_dump(mode="json"), words) if raw is None else raw
+    try:
+        return float(np.clip(in_unit(str(raw), span.unit), *span.ends))
+    except ValueError:
+        if isinstance(raw, dict | list | bool):
+            raise CaseError(f"--over {span.key}: is no number in the case, but {type(raw).__name__}") from None
+        return span.first
+
+
+def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
+    """The problem at a value of the key.
+
+    Raises
+    ------
+    CaseError
+        If it is not valid.
+    """
+    varied, assignment = copy.deepcopy(source), f"{span.key}={span.text(value)}"
+    try:
+        override(varied, assignment)
+        problem: Problem = made(varied).problem()
+        refuse_beyond_memory(problem)
+    except CaseError as e:
+        raise CaseError(str(e).replace(f"--set {assignment}", f"--over {assignment}")) from None
+    return with_modes(problem, MPI.COMM_SELF) if problem.awaited else problem
+
+
+def _identity(source: Source, span: Range, made: Made) -> str:
+    """Hash of the case and the range."""
+    case = made(source)
+    data = [case.model_dump(mode="json") | case.outside, asdict(span)]
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class _Journal:
+    """The results of the solves of a part of the boundary, a file each, and of the whole part.
+
+    `recorded` replays what these sources have kept of an interrupted one.
+    """
+
+    def __init__(self, folder: Path, identity: str, part: str) -> None:
+        self._folder, self._name, self._count = folder, f"{identity}-{part}", 0
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """What the part has found; empty until it is finished."""
+        return self._kept(self._name) or {}
+
+    def finish(self, outcome: dict[str, Any]) -> None:
+        """Keep the whole part in place of its solves."""
+        keep(self._folder / f"{self._name}.json", {"sources": code_version(), "outcome": outcome})
+        for file in self._folder.glob(f"{self._name}-*.json"):
+            file.unlink(missing_ok=True)
+
+    def recorded(self, solve: Callable[[], Locus | str]) -> Locus | str:
+        """The result of a solve, or that of an interrupted boundary at this place."""
+        name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
+        if (known := self._kept(name)) is not None:
+            return _locus(known) if "state" in known else str(known["reason"])
+        found = solve()
+        content = {"reason": found} if isinstance(found, str) else _as_data(found)
+        keep(self._folder / f"{name}.json", {"sources": code_version(), "outcome": content})
+        return found
+
+    def _kept(self, name: str) -> dict[str, Any] | None:
+        return kept(self._folder / f"{name}.json", ANY, "outcome", sources=code_version())
+
+
+def _text(v: Vector) -> str:
+    return base64.b64encode(np.ascontiguousarray(v).tobytes()).decode()
+
+
+def _vector(text: str) -> Vector:
+    return np.frombuffer(base64.b64decode(text)).copy()
+
+
+def _as_data(locus: Locus) -> dict[str, Any]:
+    data = {each.name: getattr(locus, each.name) for each in fields(locus)}
+    state = {"u": _text(locus.state.u), "mu": locus.state.mu}
+    way = {"du": _text(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
+    return data | {"state": state, "way": way, "phi": _text(locus.phi)}
+
+
+def _locus(data: dict[str, Any]) -> Locus:
+    state = State(_vector(data["state"]["u"]), data["state"]["mu"])
+    way = Way(_vector(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
+    return Locus(**{**data, "state": state, "way": way, "phi": _vector(data["phi"])})
+
+
+def _begin(source: Source, span: Range, value: float, made: Made, journal: _Journal, say: Say) -> dict[str, Any]:
+    """The run to the instability, as data; without a label there is none."""
+    for end in span.ends:
+        _problem(source, span, made, end)
+    if journal.outcome:
+        return journal.outcome
+    scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
+    records, lost = list[Record](), None
+    try:
+        records.extend(follow(scene, search=False, remark=say))
+    except Stopped as e:  # what lies beyond an instability does not matter
+        lost = e
+    try:
+        found = instability(records)
+    except CaseError:
+        if lost:
+            raise lost from None
+        return {"label": "", "mode": ""}
+    state = found.point.state
+    outcome = {
+        "label": found.label,
+        "mode": found.mode,
+        "amplitude": found.amplitude,
+        "step": found.step,
+        "value": state.mu[found.amplitude],
+        "u": _text(state.u),
+        "mu": state.mu,
+        "factorisations": scene.newton.factorisation.count,
+    }
+    journal.finish(outcome)
+    return outcome
+
+
+def _followed(
+    source: Source, span: Range, value: float, sense: int, made: Made, begin: dict[str, Any], own: _Journal, say: Say
+) -> dict[str, Any]:
+    """One direction of the boundary: its rows from the start, and why it stopped if it did."""
+    scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
+    u = _vector(begin["u"])
+    point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
+    record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
+    try:
+        varied = Varied(scene, record, partial(_problem, source, span, made), value, span.ends)
+    except (CaseError, NoSystem) as e:
+        raise CaseError(f"--over {span.key}: {e}") from None
+    scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
+    curve = Boundary(varied, varied.name, varied.kind, scales, own.recorded)
+    rows: list[dict[str, Any]] = []
+
+    def take(label: Label, locus: Locus) -> None:
+        row = _row(varied, label, locus)
+        rows.append(row)
+        beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
+        say(f"{span.key} = {span.text(row['key'])}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}")
+
+    try:
+        start = curve.start(value, *varied.start())
+        rows.append(_row(varied, "start", start))
+        for label, locus in curve.followed(start, sense, span.ends, span.steps):
+            take(label, locus)
+    except BoundaryLost as e:
+        if not rows:
+            raise Stopped(str(e)) from None
+        return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": varied.alone}
+    return {"rows": rows, "stopped": "", "alone": varied.alone}
+
+
+def _row(varied: Varied, label: Label, locus: Locus) -> dict[str, Any]:
+    load = locus.state.mu[varied.name]
+    column = amplitude(varied.name).column
+    sizes = sizes_in_units(varied.problem(locus.p))
+    measured = sizes.values({column: load})
+    return {
+        "key": float(locus.p),
+        "load": float(load),
+        "kind": label if label in SPECIAL else varied.kind,
+        "mode": varied.mode,
+        "error": float(locus.load_error),
+        "unstable": int(locus.unstable),
+        "factorisations": int(locus.factorisations),
+        **{name: float(number) for name, number in measured.items()},
+    }
+
+
+def _put_together(
+    found: dict[int, dict[str, Any]], begin: dict[str, Any], span: Range, name: str, settings: Sequence[str]
+) -> StabilityBoundary:
+    """Both directions as one curve, and what it says."""
+    down, up = (found.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
+    rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
+    special = [row for row in rows if row["kind"] in SPECIAL]
+    said = [
+        f"{span.key} = {row['key']:.9g} {span.unit}".rstrip() + f", load {row['load']:.9g}: {SAID[row['kind']]}"
+        for row in special
+    ]
+    content = {
+        "case": name,
+        "settings": list(settings),
+        "key": span.key,
+        "unit": span.unit,
+        "from": span.first,
+        "to": span.last,
+        "load": begin["amplitude"],
+        "kind": begin["label"],
+        "mode": begin["mode"],
+        "points": len(rows),
+        "special": special,
+        "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],
+        "factorisations": {"run": begin["factorisations"], "boundary": sum(row["factorisations"] for row in rows)},
+        "stopped": [part["stopped"] for part in (down, up) if part["stopped"]],
+    }
+    return StabilityBoundary(rows, content)
+
+
+def _write(done: StabilityBoundary, folder: Path) -> None:
+    more = [name for name in done.rows[0] if name not in COLUMNS]
+    write_object(folder / "boundary.json", done.content)
+    write_csv(done.rows, (*COLUMNS, *more), folder / "boundary.csv")
+    draw_boundary(done.rows, done.content, folder / "boundary.png")

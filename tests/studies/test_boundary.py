@@ -1,0 +1,120 @@
+"""Boundaries of stability: a shallow arch against its closed form and against runs, resume, and what is refused."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES
+
+import magshell_fenicsx as ms
+from magshell_fenicsx.input.source import CaseError
+
+ARCH = CASES / "arch_boundary.yaml"
+KEY = "loading.0.factor"
+
+
+def folds(*settings: str) -> list[float]:
+    """The loads of all folds of a run."""
+    onward = ["loading.1.until=points", "loading.1.points=80"]
+    scene = ms.Scene(ms.Case.load(ARCH, [*settings, *onward]))
+    return [r.point.state.mu["load"] for r in ms.follow(scene) if r.label == "fold"]
+
+
+def test_snapping_begins_at_a_rise_of_one(tmp_path: Path) -> None:
+    """Fung and Kaplan (NACA TN 2840): folds at a load of 2 e -+ 4 ((e^2 - 1)/3)^(3/2), here for a/h = 1/100.
+
+    In the unknown a of the first sine the load is 2 (e - a) + 2 a (e^2 - a^2), stationary at 3 a^2 = e^2 - 1.
+    """
+    done = magshell("boundary", ARCH, "--over", f"{KEY}=0.7:1.3:6", "--set", f"{KEY}=1.2", "--out", tmp_path / "b")
+    assert done.returncode == 0, done.stderr
+    assert "a cusp, where two folds are born" in done.stdout
+    rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
+    assert (tmp_path / "b" / "boundary.png").exists()
+    (cusp,) = (row for row in rows if row["kind"] == "cusp")
+    assert float(cusp["key"]) == pytest.approx(1.0, abs=1e-4)
+    assert float(cusp["load"]) == pytest.approx(2.0, rel=1e-3)
+    assert {row["kind"] for row in rows} == {"cusp", "fold"}
+    assert float(rows[0]["key"]) == float(rows[-1]["key"]) == 1.3
+    for row in rows:
+        rise, load = float(row["key"]), float(row["load"])
+        half = 4 * (max(rise**2 - 1, 0) / 3) ** 1.5
+        assert min(abs(load - 2 * rise - half), abs(load - 2 * rise + half)) < 2e-3
+
+
+@pytest.mark.slow
+def test_against_runs_through_the_cusp(tmp_path: Path) -> None:
+    """Load 1e-7 of that of runs at the same rise; 20 points cost at most four runs to the fold."""
+    found = ms.boundary(ARCH, f"{KEY}=0.7:1.6:12", out=tmp_path / "b")
+    assert not found.stopped
+    ordinary = [row for row in found.rows if row["kind"] == "fold"]
+    for row in ordinary[:: max(1, len(ordinary) // 7)]:
+        of_runs = folds(f"{KEY}={row['key']!r}")
+        assert min(abs(load - row["load"]) for load in of_runs) < 1e-7 * abs(row["load"])
+    work = found.content["factorisations"]
+    assert 20 * work["boundary"] / len(found.rows) < 4 * work["run"]
+
+
+@pytest.mark.slow
+def test_a_number_of_the_shape(tmp_path: Path) -> None:
+    """The drawn rise in place of the grown one, in scenes that are made again: against runs, 1e-7."""
+    key = "shell.imperfections.0.amplitude"
+    fixed = [f"{KEY}=1"]
+    found = ms.boundary(ARCH, f"{key}=0.75:0.85:2", [*fixed, f"{key}=0.8"], tmp_path / "b")
+    for row in (found.rows[0], found.rows[-1]):
+        assert min(abs(load - row["load"]) for load in folds(*fixed, f"{key}={row['key']!r}")) < 1e-7 * row["load"]
+
+
+@pytest.mark.slow
+def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
+    """Before the fold from sqrt(5.5) on; that boundary turns at 2, both in the limit of shallow arches."""
+    found = ms.boundary(ARCH, f"{KEY}=1.8:2.7:8", [f"{KEY}=2.6"], tmp_path / "b")
+    assert found.content["kind"] == "bifurcation"
+    places = {kind: [row["key"] for row in found.special if row["kind"] == kind] for kind in ("meeting", "turn")}
+    assert places["turn"] == pytest.approx([2.0], rel=1e-3)
+    assert places["meeting"] == pytest.approx(2 * [np.sqrt(5.5)], rel=1e-3)
+    assert found.rows[-1]["unstable"] == 0
+
+
+class Killed(Exception):
+    pass
+
+
+def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:
+    """The same numbers, and no solve twice."""
+    over, settings = f"{KEY}=1.2:1.3:3", [f"{KEY}=1.3"]
+    said: list[str] = []
+
+    def killed(line: str) -> None:
+        said.append(line)
+        if len(said) == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        ms.boundary(ARCH, over, settings, tmp_path / "b", say=killed)
+    kept = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "b" / "points").glob("*down-*.json")}
+    assert len(kept) >= 3
+    seen: list[str] = []
+    again = ms.boundary(ARCH, over, settings, tmp_path / "b", say=seen.append)
+    whole = ms.boundary(ARCH, over, settings, tmp_path / "whole")
+    assert again.rows == whole.rows
+    assert seen[1:3] == said[1:3]
+
+
+@pytest.mark.parametrize(
+    ("over", "settings", "said"),
+    [
+        ("loading.0.factor", [], "write it as key.path=first:last"),
+        (f"{KEY}=1:1", [], "two different finite numbers"),
+        (f"{KEY}=1:1.5:0", [], "allowed 1 to 1000"),
+        ("mesh.size=0.1:0.2", [], "is no part of the shell or of its loads"),
+        ("boundary.left=1:2", [], "boundary.left"),
+        ("shell.poisson_ratio=0:0.9", [], "shell.poisson_ratio"),
+        ("shell.density=1:2", [], "it has no influence on this instability"),
+        (f"{KEY}=1:1.6", ["loading.1.until=target", "loading.1.factor=0.5"], "the case ends without an instability"),
+    ],
+)
+def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], said: str) -> None:
+    with pytest.raises(CaseError, match=said):
+        ms.boundary(ARCH, over, settings, tmp_path / "b")
