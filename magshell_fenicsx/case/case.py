@@ -138,6 +138,11 @@ class Case(WithParts):
             raise ValueError(
                 "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
             )
+        if self.magnetic and self.magnetic.energy != "full" and self.shell.law != "koiter":
+            raise ValueError(
+                f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; with "
+                f"shell.law: {self.shell.law} give full"
+            )
         layers = self.magnetic.remanent.layers if self.magnetic else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -223,6 +228,8 @@ class Case(WithParts):
             raise ValueError(
                 f"magnetic.energy: {self.magnetic.energy}: the expansions are of a shell; a solid has the full energy"
             )
+        if self.shell.law == "mooney-rivlin":
+            raise ValueError("shell.law: mooney-rivlin: is of a shell; a solid is neo-Hookean")
         self.mesh.refuse_unfit_solid(read=isinstance(self.shell, MeshSurface))
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.kinematics import curvature_components, strain_components
-from magshell_fenicsx.models.shell.law import Koiter
+from magshell_fenicsx.models.shell.law import Law
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ class NaturalFrame:
         """U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
-    def moment(self, E: Array, K: Array, law: Koiter) -> Array:
+    def moment(self, E: Array, K: Array, law: Law) -> Array:
         """M (..., 3) over E h R, what works on K."""
         up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
         M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
@@ -155,7 +155,7 @@ def _components(S: Array) -> Array:
     return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
 
 
-def bending_moment(E: Array, K: Array, law: Koiter) -> Array:
+def bending_moment(E: Array, K: Array, law: Law) -> Array:
     """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
     return np.stack(law.moment(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 

@@ -32,9 +32,9 @@ class PressureSection(PathStep):
     """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
     `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
-    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e3, le=1e3)
+    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target p; with control: load or arc [p_c]"""
-    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-5, le=5)
+    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target ΔV; with control: volume or arc [R³]"""
 
     def course(self, here: Here) -> Course:
