@@ -1,6 +1,7 @@
 """A live pressure, and what is seen of it."""
 
 from dataclasses import replace
+from functools import partial
 from math import copysign, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -13,7 +14,10 @@ from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 
+BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
+
 if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.path import StepOptions
     from magshell_fenicsx.models.shell.parameters import Loads
 
 
@@ -40,7 +44,10 @@ class PressureSection(PathStep):
     def course(self, here: Here) -> Course:
         course = super().course(here)
         if here.open and "control" not in self.model_fields_set:
-            return replace(course, drive=replace(course.drive, control="arc"))
+            course = replace(course, drive=replace(course.drive, control="arc"))
+        if here.context.shell.rubber is not None and course.drive.first < 0:  # blown up far beyond p_c
+            finer = partial(_longer, BLOWN / here.h)
+            course = replace(course, drive=replace(course.drive, scale=1 / here.h), finer=finer)
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
@@ -59,6 +66,10 @@ class PressureSection(PathStep):
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return copysign(0.1, change)
+
+
+def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
+    return replace(steps, largest=factor * steps.largest)
 
 
 class PressureSeen(Seen):
