@@ -17,6 +17,7 @@ from magshell_fenicsx.output.pictures.colours import (
     moments,
     shell,
     strains,
+    stretches,
 )
 from magshell_fenicsx.output.pictures.layout import (
     Arrow,
@@ -71,6 +72,7 @@ PICTURES: dict[str, Callable[[Surface, float], Content]] = {
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
     "strains": lambda surface, h: Content(strains(surface), jump_said(surface.strain_jump, "strains")),
     "moments": lambda surface, h: Content(moments(surface), jump_said(surface.jump, "moments")),
+    "stretches": lambda surface, h: Content(stretches(surface)),
     "fields": _with_arrows,
     "contact": lambda surface, h: _of_contact(surface),
 }
