@@ -6,6 +6,7 @@ A form with one argument compiles up to ten times faster than that of a matrix.
 from collections.abc import Mapping
 
 import numpy as np
+import pytest
 import scipy.sparse
 import ufl
 from dolfinx import fem
@@ -69,3 +70,27 @@ def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, floa
         error = K @ v - (expected + (v - free))
         worst = max(worst, float(np.abs(error).max() / np.abs(expected).max()))
     return worst
+
+
+def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> None:
+    """Compare residual and tangent with finite differences of the energy."""
+    rng = np.random.default_rng(1)
+    v = rng.standard_normal(u.size)
+    v[system._fixed] = 0
+
+    def energy(x: np.ndarray) -> float:
+        return sum((mu[t.amplitude] if t.amplitude else 1) * system.energies(x, mu)[t.name] for t in system.terms)
+
+    e = 1e-5
+    slope = (8 * (energy(u + e * v) - energy(u - e * v)) - (energy(u + 2 * e * v) - energy(u - 2 * e * v))) / (12 * e)
+    R = system.residual(u, mu)
+    assert R @ v == pytest.approx(slope, rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v))
+    K = csr(system.tangent(u, mu))
+    assert abs(K - K.T).max() <= 1e-12 * abs(K).max()
+    rate = (
+        8 * (system.residual(u + e * v, mu) - system.residual(u - e * v, mu))
+        - (system.residual(u + 2 * e * v, mu) - system.residual(u - 2 * e * v, mu))
+    ) / (12 * e)
+    Kv = K @ v
+    free = np.setdiff1d(np.arange(u.size), system._fixed)
+    assert np.linalg.norm((Kv - rate)[free]) <= 1e-6 * np.linalg.norm(Kv)

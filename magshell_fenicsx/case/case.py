@@ -153,6 +153,16 @@ class Case(WithParts):
             raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
         if self.magnetic and self.magnetic.without_field and not self.sensors:
             raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
+        if self.magnetic and self.magnetic.energy != "full" and self.shell.law != "koiter":
+            raise ValueError(
+                f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; "
+                f"with shell.law: {self.shell.law} give full"
+            )
+        if self.sensors and self.shell.law != "koiter":
+            raise ValueError(
+                f"sensors: need shell.law: koiter: the field of a shell that gets thinner, as with {self.shell.law}, "
+                "is not built"
+            )
         layers = self.remanent.layers if self.remanent else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -241,6 +251,8 @@ class Case(WithParts):
             raise ValueError(
                 f"magnetic.energy: {self.magnetic.energy}: the expansions are of a shell; a solid has the full energy"
             )
+        if self.shell.law == "mooney-rivlin":
+            raise ValueError("shell.law: mooney-rivlin: is of a shell; a solid is neo-Hookean")
         self.mesh.refuse_unfit_solid(read=isinstance(self.shell, MeshSurface))
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")

@@ -106,7 +106,7 @@ def _changed(case: Case, key: str, value: Any) -> Case:
     part: Any = data
     for name in path:
         part = part[int(name)] if isinstance(part, list) else part.setdefault(name, {})
-    at = int(last) if isinstance(part, list) else last
+    at: Any = int(last) if isinstance(part, list) else last
     known = part[at] if isinstance(part, list) else part.get(at)
     unit = number_and_unit(known)[1] if isinstance(known, str) else ""
     part[at] = f"{value / si_size(unit)!r} {unit}" if unit else value

@@ -65,7 +65,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     """
     case = case.with_terms([*case.own_terms, *terms]) if terms else case
     terms = case.own_terms
-    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
+    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
     ground = ground_of(case.shell)
     perfect = ground.perfect
     found = flaws(case.imperfections, ground)

@@ -190,7 +190,7 @@ class Boundary:
                     yield from self._between(here, *last)
                     yield "end", last[0]
                     return
-            found = "the end of the range is not reached at once"
+            found: Locus | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
                 found = self._at_distance(here, guess, length)
             if isinstance(found, str):
@@ -431,7 +431,7 @@ class _Lines:
 
     def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
         """The derivative by p at fixed u and amplitude."""
-        return np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0)
+        return np.asarray(np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0))
 
     def balance(self, residual: Vector) -> None:
         """Take the residual at a state close by, with the same factors."""
@@ -470,7 +470,7 @@ class _Lines:
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
         v, w = self._tangent.v, self.w_mu
         mixed = mixed_third(system, state, v, w) - self.K_mu_v
-        self._largest = dot(comm, np.abs(mixed), np.abs(v))
+        self._largest = dot(comm, abs(mixed), np.asarray(abs(v), dtype=np.float64))
         mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
         ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
         by_mu = dot(comm, v, (ahead - back) / (2 * d)) - dot(comm, w, self.K_mu_v)

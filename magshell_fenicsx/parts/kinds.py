@@ -4,9 +4,9 @@ A new kind is such a file, named after it, and its name here.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
 
-from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
 from magshell_fenicsx.input.section import Chosen, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
@@ -56,12 +56,32 @@ Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 class ShellKeys(Section):
     """What parts add to the keys of every shell."""
 
+    law: Literal["koiter", "neo-hookean", "mooney-rivlin"] = "koiter"
+    """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6 (C10 + C01)"""
+    mooney: float | None = Field(default=None, ge=0, le=1000)
+    """C01/C10 of law: mooney-rivlin"""
     viscosity: Time | None = None
     """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
     relaxation: Branches = Field(default=[])
     """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
     imperfections: Imperfections = Field(default=[])
     """Deviations of the mid-surface along its normal, added up"""
+
+    @model_validator(mode="after")
+    def _law_fits(self) -> Self:
+        if (self.mooney is not None) != (self.law == "mooney-rivlin"):
+            raise ValueError(
+                f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}"
+            )
+        if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
+            raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
+        return self
+
+    @property
+    def rubber(self) -> float | None:
+        """C01/(C10 + C01); None of Koiter's law."""
+        ratio = self.mooney or 0.0
+        return None if self.law == "koiter" else ratio / (1 + ratio)
 
     @classmethod
     def note_sizes(

@@ -60,6 +60,7 @@ class GradientsSection(Section):
 
 DRAWN = (  # fields with colours
     *("w_over_h", "E_1", "E_2", "M_1", "M_2"),
+    *("stretch_1", "stretch_2", "stretch_3", "sigma_1", "sigma_2"),
     *("p_mag", "f_mag", "k", "tau", "couple", "gap_over_h", "contact_pressure"),
 )
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -88,7 +89,8 @@ class OutputSection(Section):
     camera: CameraSection | None = None
     """From where the shell is seen; by default from above, on the side of its largest displacement"""
     ranges: dict[str, Range] = Field(default_factory=dict)
-    """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, p_mag, f_mag, k, tau, couple,
+    """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, stretch_1, stretch_2, stretch_3,
+    sigma_1, sigma_2, p_mag, f_mag, k, tau, couple,
     gap_over_h, contact_pressure; by default those of the data"""
 
     @field_validator("ranges")

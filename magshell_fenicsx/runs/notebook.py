@@ -52,7 +52,7 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
 def picture(
     scene: Scene,
     record: Record,
-    of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
+    of: Literal["shell", "strains", "stretches", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
     """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields."""
     if of not in PICTURES:

@@ -7,7 +7,7 @@ and goes on where it was interrupted.
 import hashlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -233,7 +233,7 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
     for target in wanted.targets.values():
-        by_first(comm, lambda target=target: drawn(reached_shape(folder / "verified", target)))
+        by_first(comm, partial(_draw_reached, drawn, folder / "verified", target))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
@@ -288,6 +288,10 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
         if key == "file" and isinstance(value, str) and value != "best.csv":
             part[key] = os.path.relpath(old / value, new)
         _from_here(value, old, new)
+
+
+def _draw_reached(drawn: Callable[..., None], folder: Path, target: Callable[[Array], Array]) -> None:
+    drawn(reached_shape(folder, target))
 
 
 def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.law import Koiter
+from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.parts.natural.shape import Forms
 
 
@@ -32,7 +32,7 @@ def antisymmetric_edge(
     sigma: Expr,
     mirror: Expr,
     *,
-    law: Koiter,
+    law: Law,
     natural: Forms | None = None,
 ) -> Expr:
     """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.

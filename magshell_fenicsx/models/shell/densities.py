@@ -5,20 +5,21 @@ of order one. An energy is the integral of density times area_ratio(r0).
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.law import Koiter, work
+from magshell_fenicsx.models.shell.law import Law, work
 from magshell_fenicsx.parts.magnetism.applied import around
 from magshell_fenicsx.parts.natural.shape import Forms
 
-MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
+MagneticDensity = Callable[..., Expr]  # of (r0, u, Br, Ba), and the natural forms where these are known
 
 
-def membrane(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> Expr:
+def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
     """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural` forms."""
     E = kin.membrane_strain(r0, u)
     if natural is None:
@@ -26,15 +27,17 @@ def membrane(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> E
     return natural.area * law.thicker(natural.thickness).membrane(E - natural.strain, natural.up)
 
 
-def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Koiter, natural: Forms | None = None) -> Expr:
-    """S : (v_i . v_j)/2 with the membrane stress S of the strain E_11, E_12, E_22: what it adds to the energy of v."""
+def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
+    """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to S: what that adds to the energy of v."""
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
+    present = kin.membrane_strain(r0, u)
     if natural is None:
-        return work(law.stress(strain, kin.inverse_metric(r0)), kin.metric(v)) / 2
-    return natural.area * work(law.thicker(natural.thickness).stress(strain, natural.up), kin.metric(v)) / 2
+        return work(law.stress_change(present, strain, kin.inverse_metric(r0)), kin.metric(v)) / 2
+    law = law.thicker(natural.thickness)
+    return natural.area * work(law.stress_change(present - natural.strain, strain, natural.up), kin.metric(v)) / 2
 
 
-def bending(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> Expr:
+def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
     """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
     E, K = kin.membrane_strain(r0, u), kin.curvature_change(r0, u)
     if natural is None:
@@ -42,9 +45,7 @@ def bending(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> Ex
     return natural.area * law.thicker(natural.thickness).bending(E - natural.strain, K - natural.bend, natural.up)
 
 
-def normal_moment(
-    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Koiter, natural: Forms | None = None
-) -> tuple[Expr, Expr]:
+def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None) -> tuple[Expr, Expr]:
     """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a penalty."""
     E, K = kin.membrane_strain(r0, u), kin.curvature_change(r0, u)
     if natural is None:
@@ -64,14 +65,23 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
 
 
+def magnetic_thinned(r0: Jet, u: Jet, Br: Expr, Ba: Expr, *, natural: Forms | None = None) -> Expr:
+    """That of a volume that stays: n (x) n0 in F has the stretch of the thickness, of the `natural` volume."""
+    r, n0 = r0 + u, kin.normal(r0)
+    thinned = kin.area_ratio(r0) / kin.area_ratio(r)
+    if natural is not None:
+        thinned *= natural.area * natural.thickness
+    return magnetic(r0, u, Br, Ba) - (thinned - 1) * ufl.dot(Ba, kin.normal(r)) * ufl.dot(n0, Br)
+
+
 def in_gradient(law: MagneticDensity) -> MagneticDensity:
     """The part of Ba = G r, of (r0, u, Br, G): -(G r) . F Br at the deformed position, without its value at u = 0.
 
     `law` is `magnetic`, or has R in place of F.
     """
 
-    def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr) -> Expr:
-        return law(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
+    def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr, **known: Any) -> Expr:
+        return law(r0, u, Br, ufl.dot(G, r0.r + u.r), **known) - ufl.dot(ufl.dot(G, u.r), Br)
 
     return magnetic_gradient
 
@@ -79,9 +89,9 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
 def in_space(law: MagneticDensity) -> MagneticDensity:
     """That of a field known by values, of (r0, u, Br, P): P as of `applied.around`; `law` as above."""
 
-    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr) -> Expr:
+    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **known: Any) -> Expr:
         B, change = around(P, u.r)
-        return law(r0, u, Br, B) - ufl.dot(change, Br)
+        return law(r0, u, Br, B, **known) - ufl.dot(change, Br)
 
     return magnetic_in_space
 

@@ -21,7 +21,7 @@ from magshell_fenicsx.assembly.batches import interior_batches
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.law import Koiter
+from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.parts.natural.shape import Forms
 
 Sides = tuple[Jet, Jet]
@@ -55,7 +55,7 @@ def two_sided(
     width: Expr,
     sigma: Expr,
     *,
-    law: tuple[Koiter, Koiter],
+    law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
     """Energy of an interior edge with that jump per length of its parameter.
@@ -83,7 +83,7 @@ def two_sided(
 
 
 def interior(
-    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Koiter, Koiter], natural: Shapes | None = None
+    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Law, Law], natural: Shapes | None = None
 ) -> Expr:
     """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
@@ -95,7 +95,7 @@ def interior(
 
 
 def folded(
-    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Koiter, Koiter], natural: Shapes | None = None
+    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Law, Law], natural: Shapes | None = None
 ) -> Expr:
     """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size.
 
@@ -136,7 +136,7 @@ def clamped(
     sigma: Expr,
     turn: Expr | None = None,
     *,
-    law: Koiter,
+    law: Law,
     natural: Forms | None = None,
 ) -> Expr:
     """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
@@ -148,7 +148,7 @@ def clamped(
 
 
 def symmetric(
-    r0: Jet, u: Jet, m: Expr, width: Expr, sigma: Expr, mirror: Expr, *, law: Koiter, natural: Forms | None = None
+    r0: Jet, u: Jet, m: Expr, width: Expr, sigma: Expr, mirror: Expr, *, law: Law, natural: Forms | None = None
 ) -> Expr:
     """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
     nu1, nu2, stretch = kin.conormal(r0, m)

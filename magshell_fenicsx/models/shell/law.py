@@ -4,11 +4,12 @@ Energies are over E h per undeformed area, lengths over R. E is the membrane str
 (..., 2, 2) in coordinates of the surface; `up` is the inverse metric of the shape without stress. Every formula is one
 of components, so that it holds for an expression of UFL at a point and for arrays of NumPy over many points.
 
-A further law is a class with the methods of `Koiter`, and a line in `parameters.Material.law`.
+A further law is a `Law`, and a line in `parameters.Material.law`.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 from ufl.core.expr import Expr
 
@@ -20,53 +21,66 @@ Components: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 12 and 22 of a symm
 
 
 @dataclass(frozen=True)
-class Koiter:
-    """Stress is linear in strain; stretching and bending do not know of each other.
+class Law(ABC):
+    """What energies, edges, pictures and motions ask of a material.
 
     Attributes
     ----------
     h
         The thickness that energies are over.
-    nu
-        Poisson's ratio.
+    number
+        The law's own number.
     t
         What multiplies the thickness.
+    thins
+        Whether the thickness follows from the area, so that the volume stays.
     """
 
     h: Scalar
-    nu: Scalar
+    number: Scalar
     t: Scalar = 1
+    thins: ClassVar[bool] = False
 
     @property
     def numbers(self) -> tuple[Scalar, ...]:
         """All but `t`, in their order."""
-        return self.h, self.nu
+        return self.h, self.number
 
-    def thicker(self, factor: Scalar) -> "Koiter":
+    def thicker(self, factor: Scalar) -> Self:
         """That of a shell so many times as thick."""
         return replace(self, t=factor * self.t)
 
     @property
-    def bending_stiffness(self) -> Scalar:
-        """D/(E h R^2)."""
-        return self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
+    @abstractmethod
+    def linear(self) -> "Koiter":
+        """The same at small strains."""
 
+    @property
+    @abstractmethod
+    def bending_stiffness(self) -> Scalar:
+        """D/(E h R^2) at small strains."""
+
+    @abstractmethod
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         """The energy of stretching."""
-        return self.t * self._square(E, up) / (2 * (1 - self.nu**2))
 
+    @abstractmethod
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        """The energy of bending."""
-        return self.bending_stiffness / 2 * self._square(K, up)
+        """The energy of bending, quadratic in K."""
 
+    @abstractmethod
     def stress(self, E: Tensor, up: Tensor) -> Components:
         """The derivative of `membrane` by E."""
-        return self._scaled(self.t / (1 - self.nu**2), E, up)
 
+    @abstractmethod
+    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
+        """The stress of E and a change of it, less that of E."""
+
+    @abstractmethod
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         """The derivative of `bending` by K."""
-        return self._scaled(self.bending_stiffness, K, up)
 
+    @abstractmethod
     def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         """The moment twice along a covector c.
 
@@ -75,11 +89,48 @@ class Koiter:
         across, square
             c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural stretch.
         """
+
+    @abstractmethod
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is proportional."""
+
+
+@dataclass(frozen=True)
+class Koiter(Law):
+    """Stress is linear in strain; stretching and bending do not know of each other. Its number is Poisson's ratio."""
+
+    @property
+    def nu(self) -> Scalar:
+        return self.number
+
+    @property
+    def linear(self) -> "Koiter":
+        return self
+
+    @property
+    def bending_stiffness(self) -> Scalar:
+        return self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        return self.t * self._square(E, up) / (2 * (1 - self.nu**2))
+
+    def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        return self.bending_stiffness / 2 * self._square(K, up)
+
+    def stress(self, E: Tensor, up: Tensor) -> Components:
+        return self._scaled(self.t / (1 - self.nu**2), E, up)
+
+    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
+        return self.stress(change, up)
+
+    def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        return self._scaled(self.bending_stiffness, K, up)
+
+    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         bent = K[..., 0, 0] * across[0] ** 2 + 2 * K[..., 0, 1] * across[0] * across[1] + K[..., 1, 1] * across[1] ** 2
         return self.bending_stiffness * ((1 - self.nu) * bent + self.nu * square * trace(K, up))
 
     def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is proportional."""
         return self.bending_stiffness * square**2
 
     def _square(self, S: Tensor, up: Tensor) -> Scalar:
@@ -116,7 +167,7 @@ def work(S: Components, T: Tensor) -> Scalar:
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
 
 
-def elastic(density: Density, law: Koiter, t: Parameter | None = None) -> Density:
+def elastic(density: Density, law: Law, t: Parameter | None = None) -> Density:
     """Of a density that takes a `law`, on two sides a pair of laws, that of a law whose numbers are constants.
 
     `t` is what multiplies the thickness, (1,); None for 1.

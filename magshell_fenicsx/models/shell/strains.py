@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.kinematics import curvature_components, strain_components
-from magshell_fenicsx.models.shell.law import Koiter
+from magshell_fenicsx.models.shell.law import Law
 
 Array = NDArray[np.float64]
 
@@ -80,9 +80,17 @@ class TangentFrame:
         m, area = _area_vector(self.jet[:3] + u[:3])
         return np.asarray(m / area[..., None])
 
-    def convected(self, v: Array, u: Array) -> Array:
-        """F v with F = a_i (x) a0^i + n (x) n0, of vectors (..., 3): how a remanence moves with the shell."""
-        return self._carried(self._deformed(u), v, u)
+    def convected(self, v: Array, u: Array, *, thins: bool = False) -> Array:
+        """F v with F = a_i (x) a0^i + s n (x) n0, of vectors (..., 3): how a remanence moves with the shell.
+
+        The stretch s of the thickness is 1, or that of a volume that stays.
+        """
+        found = self._carried(self._deformed(u), v, u)
+        if not thins:
+            return found
+        m, area = _area_vector(self.jet[:3] + u[:3])
+        thinned = self.area / area - 1
+        return np.asarray(found + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
         """R v with the rotation R of F, of vectors (..., 3); see `magnetism.laws`."""
@@ -140,7 +148,7 @@ class NaturalFrame:
         """U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
-    def moment(self, E: Array, K: Array, law: Koiter) -> Array:
+    def moment(self, E: Array, K: Array, law: Law) -> Array:
         """M (..., 3) over E h R, what works on K."""
         up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
         M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
@@ -155,7 +163,7 @@ def _components(S: Array) -> Array:
     return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
 
 
-def bending_moment(E: Array, K: Array, law: Koiter) -> Array:
+def bending_moment(E: Array, K: Array, law: Law) -> Array:
     """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
     return np.stack(law.moment(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 

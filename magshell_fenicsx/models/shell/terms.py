@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.bodies.contact import (
     pressed_radius,
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
-from magshell_fenicsx.parts.magnetism.laws import FULL, LINEAR, magnetic_densities
+from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
@@ -204,31 +204,40 @@ class EnergyFactory:
 
     def remanent(self, field: Magnetisation, known: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
-        pattern, carrier = field.remanent, self.carrier
+        pattern, carrier, thins = field.remanent, self.carrier, self.material.law.thins
+        full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
         if known:
-            of = densities.in_space(FULL[field.law])
-            density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED))
+            density = self._magnetised(field, densities.in_space(full), Br, known.polynomial, parts=MOVED)
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
             carrier.energy(
                 name + suffix,
-                self._thick(Density(per_area(of), (Br, self._constant(Ba)))),
+                self._magnetised(field, of, Br, self._constant(Ba)),
                 amplitude,
                 linear=name in LINEAR,
                 group=name,
                 column="magnetic",
             )
             for amplitude, suffix, Ba in directions
-            for name, of in magnetic_densities(field.law, field.energy).items()
+            for name, of in magnetic_densities(field.law, field.energy, thins=thins).items()
         ]
         if field.gradient is not None:
-            parameters = (Br, self._constant(field.gradient))
-            density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            terms.append(carrier.energy("magnetic gradient", self._thick(density), "lambda_m", column="magnetic"))
+            density = self._magnetised(
+                field, densities.in_gradient(full), Br, self._constant(field.gradient), parts=MOVED
+            )
+            terms.append(carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
+
+    def _magnetised(
+        self, field: Magnetisation, of: Callable[..., Expr], *parameters: Parameter, parts: tuple[str, ...] = FIRST
+    ) -> Density:
+        """A density of the remanence with the thickness and, if that thins with F, the natural shape."""
+        density = Density(per_area(of), parameters, parts=parts)
+        thins = self.material.law.thins and field.law == "deformation"
+        return self._thick(grown(density, self.natural) if thins and self.natural else density)
 
     def pressure(self, *, potential: bool) -> Energy:
         """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""

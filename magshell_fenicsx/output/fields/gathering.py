@@ -21,7 +21,7 @@ from magshell_fenicsx.models.axisymmetric.revolution import ENDS, Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, SurfaceGatherer, grown
 
@@ -89,6 +89,7 @@ class RevolvedGatherer:
         pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
+        values |= rubber_fields(values, self._model.material.law)
         turned = self._around(values)
         fields = self._constant | turned
         shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
@@ -161,6 +162,26 @@ def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
     }
 
 
+def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
+    """Of a material that thins, from E_1 and E_2 (...): its stretches and its true stresses over E.
+
+    Returns
+    -------
+    stretch_1, stretch_2, stretch_3
+        In the surface, the larger first, and of the thickness.
+    sigma_1, sigma_2
+        Force per deformed area of the middle layer, in the same directions.
+    """
+    if not law.thins:
+        return {}
+    E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
+    square = 1 + 2 * E
+    S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
+    stretches = [*np.sqrt(np.moveaxis(square, -1, 0)), 1 / np.sqrt(np.prod(square, axis=-1))]
+    found = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
+    return found | {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
+
+
 def in_space(S: Array, t: Array) -> Array:
     """Components (..., 3) in frames t (..., 2, 3) as tensors (..., 3, 3)."""
     return np.asarray(np.swapaxes(t, -1, -2) @ S[..., [[0, 1], [1, 2]]] @ t)
@@ -209,7 +230,7 @@ class PointFields:
         contacts: Sequence[Contact] = (),
         remanence: Magnetisation | None = None,
     ) -> None:
-        self._contacts, self._h = contacts, material.h
+        self._contacts, self._h, self._thins = contacts, material.h, material.law.thins
         self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
@@ -249,8 +270,8 @@ class PointFields:
         """
         frame, found = self._frame, dict[str, Array]()
         if self._carried:
-            carried = frame.convected if self._carried.law == "deformation" else frame.rotated
-            found["Br"] = carried(self.Br, u)
+            moves = self._carried.law == "deformation"
+            found["Br"] = frame.convected(self.Br, u, thins=self._thins) if moves else frame.rotated(self.Br, u)
         if self._field:
             found["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:

@@ -17,7 +17,7 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses
+from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
 from magshell_fenicsx.shape.solids import Solid
 
@@ -164,7 +164,7 @@ class SurfaceGatherer:
         if not self._recovered:
             return None
         smooth, jumps = self._recovered.fields(tensors, self._n0)
-        fields = self._constant | smooth | found
+        fields = self._constant | smooth | rubber_fields(smooth, self._model.material.law) | found
         return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"])
 
     def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:

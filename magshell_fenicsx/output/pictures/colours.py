@@ -13,6 +13,13 @@ Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
 STRAINS = {"E_1": "larger principal strain $E_1$", "E_2": "smaller principal strain $E_2$"}
 MOMENTS = {"M_1": "larger principal moment $M_1R/D$", "M_2": "smaller principal moment $M_2R/D$"}
+STRETCHES = {
+    "stretch_1": r"larger principal stretch $\lambda_1$",
+    "stretch_2": r"smaller principal stretch $\lambda_2$",
+    "stretch_3": r"stretch of the thickness $\lambda_3$",
+    "sigma_1": r"true stress $\sigma_1/E$",
+    "sigma_2": r"true stress $\sigma_2/E$",
+}
 LOADS = {  # caption with its unit, name in words
     "couple": (
         r"couple $|F\hat B^\mathrm{r} \times \hat B^\mathrm{a}|/(hE\lambda_\mathrm{m})$",
@@ -29,6 +36,11 @@ SCALARS = {  # of the interactive report, in HTML; of vectors the length
     "E_2": "smaller membrane strain E<sub>2</sub>",
     "M_1": "larger bending moment M<sub>1</sub>R/D",
     "M_2": "smaller bending moment M<sub>2</sub>R/D",
+    "stretch_1": "larger stretch λ<sub>1</sub>",
+    "stretch_2": "smaller stretch λ<sub>2</sub>",
+    "stretch_3": "stretch of the thickness λ<sub>3</sub>",
+    "sigma_1": "true stress σ<sub>1</sub>/E",
+    "sigma_2": "true stress σ<sub>2</sub>/E",
     "couple": "couple |B<sup>r</sup>×B<sup>a</sup>|/(hEλ<sub>m</sub>)",
     "p_mag": "magnetic pressure/(Eλ<sub>m</sub>)",
     "f_mag": "magnetic in-plane force/(Eλ<sub>m</sub>)",
@@ -97,6 +109,18 @@ def bent_alone(surface: Surface, h: float) -> str:
         f"Strains of the mid-surface are not drawn: those of bending are {times} times larger, "
         f"and the former differ from cell to cell by {100 * (surface.strain_jump or 0.0):.2g} % (rms)."
     )
+
+
+def stretches(surface: Surface) -> list[Coloured]:
+    """Stretches and true stresses of rubber; stresses are white at zero."""
+    found = []
+    for name, said in STRETCHES.items():
+        if (values := surface.fields.get(name)) is not None:
+            low, high, signed = float(values.min()), float(values.max()), name.startswith("sigma")
+            most = max(-low, high, ROUNDING["E_1"])
+            limits = (-most, most) if signed else (low, max(high, low + 1e-9))
+            found.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
+    return found
 
 
 def jump_said(jump: float | None, what: str) -> str:

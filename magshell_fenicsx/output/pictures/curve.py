@@ -172,7 +172,7 @@ def draw_hidden(axes: "Axes", of: Part) -> None:
     """Draw an unstable part that its marks hide once more in an inset, in the corner with the least of the curves."""
     if (box := hidden(axes, of)) is None:
         return
-    points = np.concatenate([line.get_xydata() for line in axes.lines if len(line.get_xydata())])
+    points = np.concatenate([np.asarray(line.get_xydata()) for line in axes.lines])
     inside = axes.transAxes.inverted().transform(axes.transData.transform(points))
     gap = 0.14  # room for the numbers of the inset
     corners = [(x, y) for y in (gap, 0.97 - INSET) for x in (0.97 - INSET, gap)]

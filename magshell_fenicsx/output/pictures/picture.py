@@ -17,6 +17,7 @@ from magshell_fenicsx.output.pictures.colours import (
     moments,
     shell,
     strains,
+    stretches,
 )
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel, Pen, columns, drawing, panel_width, panels_figure
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
@@ -59,6 +60,7 @@ PICTURES: dict[str, Callable[[Surface, float], Content]] = {
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
     "strains": lambda surface, h: Content(*strains(surface, h)),
     "moments": lambda surface, h: Content(*moments(surface, h)),
+    "stretches": lambda surface, h: Content(stretches(surface)),
     "fields": _with_arrows,
     "contact": lambda surface, h: _of_contact(surface),
 }

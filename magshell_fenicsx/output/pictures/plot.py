@@ -183,8 +183,8 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
             figure = frequencies_figure(frequencies, run.rows, style)
         yield from written(figure, style, "frequencies")
     if files := gradient_files(run.folder):
-        shells = {of: read_vtu(file)[0] for of, file in files.items()}
-        yield from written(gradients_figure(shells, style, run.camera), style, "gradients")
+        by_result = {of: read_vtu(file)[0] for of, file in files.items()}
+        yield from written(gradients_figure(by_result, style, run.camera), style, "gradients")
     if found := searched(run.rows)[:MOST_PANELS]:
         surfaces = [run.at(each)[0] for each in found]
         yield from written(solutions_figure(surfaces, found, about.h, style, run.camera), style, "solutions")

@@ -142,12 +142,19 @@ def add_shapes(
         at = np.array(place(row, parts[number].amplitude))
         corner = _free(axes, at, size, taken.setdefault(number, []))
         taken[number].append(np.array([corner, corner + size]))
-        middle = tuple(corner + size / 2)
+        middle = (float(corner[0] + size[0] / 2), float(corner[1] + size[1] / 2))
         shown = OffsetImage(image, zoom=72 / figure.dpi, resample=True)
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkB": MARK / 2}
         axes.add_artist(
             AnnotationBbox(
-                shown, tuple(at), middle, boxcoords="axes fraction", frameon=False, pad=0, arrowprops=line, zorder=3
+                shown,
+                (at[0], at[1]),
+                middle,
+                boxcoords="axes fraction",
+                frameon=False,
+                pad=0,
+                arrowprops=line,
+                zorder=3,
             )
         )
         axes.plot(*at, "o", color="k", markersize=MARK, zorder=5)
@@ -156,7 +163,7 @@ def add_shapes(
 def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array:
     """The lower left corner of a box, in parts of the axes, that covers little and is near its point."""
     inside = axes.transAxes.inverted().transform
-    curves = np.concatenate([line.get_xydata() for line in axes.lines if len(line.get_xydata())])
+    curves = np.concatenate([np.asarray(line.get_xydata()) for line in axes.lines])
     points = inside(axes.transData.transform(curves))
     target = inside(axes.transData.transform(at))
 

@@ -43,6 +43,7 @@ PICTURES = {  # in the order of the report
     "animation.gif": "The shell along the path.",
     "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
     "strains.png": "Strains of the mid-surface at the last point.",
+    "stretches.png": "Stretches of the mid-surface and true stresses at the last point.",
     "moments.png": "Bending moments at the last point.",
     "contact.png": "Gap and contact pressure of the bodies at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",

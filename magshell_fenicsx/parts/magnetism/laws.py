@@ -57,7 +57,7 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 LINEAR = ("U1", "couple")
-FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": magnetic}
+_FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": magnetic}
 _EXPANDED: dict[RemanenceLaw, dict[str, MagneticDensity]] = {
     "deformation": {
         "U1": densities.magnetic_first,
@@ -80,8 +80,13 @@ _TERMS: dict[MagneticEnergy, tuple[str, ...]] = {
 }
 
 
-def magnetic_densities(law: RemanenceLaw, energy: MagneticEnergy) -> dict[str, MagneticDensity]:
+def full_density(law: RemanenceLaw, *, thins: bool) -> MagneticDensity:
+    """The full energy's, of a shell whose thickness changes with its area or does not."""
+    return densities.magnetic_thinned if thins and law == "deformation" else _FULL[law]
+
+
+def magnetic_densities(law: RemanenceLaw, energy: MagneticEnergy, *, thins: bool) -> dict[str, MagneticDensity]:
     """Name of the term -> its density, linear in the applied field."""
     if energy == "full":
-        return {"magnetic": FULL[law]}
+        return {"magnetic": full_density(law, thins=thins)}
     return {name: _EXPANDED[law][name] for name in _TERMS[energy]}

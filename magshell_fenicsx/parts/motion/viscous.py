@@ -236,8 +236,8 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
 
     def law(side: str = "") -> Koiter:
-        """That of the shell, which a viscous stress follows too."""
-        of_shell = model.material.law
+        """That of the shell at small strains, which a viscous stress follows too."""
+        of_shell = model.material.law.linear
         return of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
 
     def viscous(j: Jet, side: str = "") -> tuple[Expr, Expr]:

@@ -1,6 +1,7 @@
 """A live pressure, a gas under the shell as its conjugate, and what is seen of both."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from math import copysign, cos, pi, radians, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -15,8 +16,11 @@ from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.sections import CapSurface, ShellSection, Surface
 
+BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
+
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
+    from magshell_fenicsx.continuation.path import StepOptions
     from magshell_fenicsx.models.shell.parameters import Loads
 
 
@@ -35,15 +39,18 @@ class PressureSection(PathStep):
     """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
     `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
-    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e3, le=1e3)
+    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target p; with control: load or arc [p_c]"""
-    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-5, le=5)
+    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target ΔV; with control: volume or arc [R³]"""
 
     def course(self, here: Here) -> Course:
         course = super().course(here)
         if here.open and "control" not in self.model_fields_set:
-            return replace(course, drive=replace(course.drive, control="arc"))
+            course = replace(course, drive=replace(course.drive, control="arc"))
+        if here.context.shell.rubber is not None and course.drive.first < 0:  # blown up far beyond p_c
+            finer = partial(_longer, BLOWN / here.h)
+            course = replace(course, drive=replace(course.drive, scale=1 / here.h), finer=finer)
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
@@ -62,6 +69,10 @@ class PressureSection(PathStep):
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return copysign(0.1, change)
+
+
+def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
+    return replace(steps, largest=factor * steps.largest)
 
 
 class PressureSeen(Seen):

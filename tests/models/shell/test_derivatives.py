@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from along import csr
+from along import check, csr
 from conftest import hemisphere, random_displacement
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -40,29 +40,6 @@ def alone(model: ShellModel, name: str) -> FiniteElementSystem:
     degree = model.V.element.basix_element.degree
     tangent = FastTangent(model.u, make_sites(model.r0, degree, [term], KernelLog()), [])
     return FiniteElementSystem(model.u, [term], [], pattern, 1.0, tangent)
-
-
-def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> None:
-    rng = np.random.default_rng(1)
-    v = rng.standard_normal(u.size)
-    v[system._fixed] = 0
-
-    def energy(x: np.ndarray) -> float:
-        return sum((mu[t.amplitude] if t.amplitude else 1) * system.energies(x)[t.name] for t in system.terms)
-
-    e = 1e-5
-    slope = (8 * (energy(u + e * v) - energy(u - e * v)) - (energy(u + 2 * e * v) - energy(u - 2 * e * v))) / (12 * e)
-    R = system.residual(u, mu)
-    assert R @ v == pytest.approx(slope, rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v))
-    K = csr(system.tangent(u, mu))
-    assert abs(K - K.T).max() <= 1e-12 * abs(K).max()
-    rate = (
-        8 * (system.residual(u + e * v, mu) - system.residual(u - e * v, mu))
-        - (system.residual(u + 2 * e * v, mu) - system.residual(u - 2 * e * v, mu))
-    ) / (12 * e)
-    Kv = K @ v
-    free = np.setdiff1d(np.arange(u.size), system._fixed)
-    assert np.linalg.norm((Kv - rate)[free]) <= 1e-6 * np.linalg.norm(Kv)
 
 
 @pytest.mark.parametrize("degree", DEGREES)

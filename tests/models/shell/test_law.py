@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import ufl
 
-from magshell_fenicsx.models.shell.law import Koiter, work
+from magshell_fenicsx.models.shell.law import Koiter, Law, work
+from magshell_fenicsx.models.shell.rubber import Rubber
 
-LAWS = [Koiter(0.05, 0.3), Koiter(0.1, 0.5).thicker(1.3)]
+LAWS = [Koiter(0.05, 0.3), Koiter(0.1, 0.5).thicker(1.3), Rubber(0.05, 0.0), Rubber(0.1, 0.3).thicker(1.3)]
 RNG, STEP = np.random.default_rng(4), 1e-30
 
 
@@ -21,14 +22,14 @@ UP = np.linalg.inv(np.eye(2) + tensors(5) / 2)
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_stress_and_moment_are_derivatives(law: Koiter) -> None:
+def test_stress_and_moment_are_derivatives(law: Law) -> None:
     """Along any strain, by complex steps: exact to rounding."""
     assert work(law.stress(E, UP), T) == pytest.approx(law.membrane(E + 1j * STEP * T, UP).imag / STEP)
     assert work(law.moment(E, K, UP), T) == pytest.approx(law.bending(E, K + 1j * STEP * T, UP).imag / STEP)
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_edges_see_the_moment_along_a_covector(law: Koiter) -> None:
+def test_edges_see_the_moment_along_a_covector(law: Law) -> None:
     c = RNG.standard_normal((5, 2))
     raised = np.einsum("...ij,...j->...i", UP, c)
     edge = UP, tuple(raised.T), np.sum(raised * c, axis=-1)
@@ -39,7 +40,7 @@ def test_edges_see_the_moment_along_a_covector(law: Koiter) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_expressions_and_arrays_agree(law: Koiter) -> None:
+def test_expressions_and_arrays_agree(law: Law) -> None:
     for e, k, up in zip(E, K, UP, strict=True):
         symbolic = [ufl.as_matrix(S.tolist()) for S in (e, k, up)]
         assert float(law.membrane(symbolic[0], symbolic[2])) == pytest.approx(law.membrane(e, up))

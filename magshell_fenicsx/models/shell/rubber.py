@@ -1,0 +1,138 @@
+"""Incompressible rubber: the energies of a neo-Hookean or Mooney-Rivlin shell at any stretch.
+
+The energy per volume is C10 (I1 - 3) + C01 (I2 - 3), E = 6 (C10 + C01). The normal stress is zero and the thickness
+follows from the area (R. W. Ogden, *Non-linear elastic deformations*, 1984): with C = a0^-1 a of the surface, t = tr C
+and d = det C, the stretch of the thickness is d^(-1/2), I1 = t + 1/d and I2 = d + t/d.
+
+A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that the energy of bending is
+
+    h^2/(24 d) K : W''(E) : K.
+
+Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see docs/theory.md, Rubber.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import ufl
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, trace
+
+
+@dataclass(frozen=True)
+class Rubber(Law):
+    """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
+
+    thins: ClassVar[bool] = True
+
+    @property
+    def linear(self) -> Koiter:
+        return Koiter(self.h, 0.5, self.t)
+
+    @property
+    def bending_stiffness(self) -> Scalar:
+        return self.linear.bending_stiffness
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        at = _Stretched(E, up)
+        return self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
+
+    def stress(self, E: Tensor, up: Tensor) -> Components:
+        at = _Stretched(E, up)
+        first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
+        second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
+        by_T, by_D = (
+            self.t / (6 * at.d) * ((1 - self.number) * one + self.number * two)
+            for one, two in zip(first, second, strict=True)
+        )
+        adjugate = E[..., 1, 1], -E[..., 0, 1], E[..., 0, 0]
+        a = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+        S11, S12, S22 = (
+            2 * by_T * raised + 4 * by_D * at.up * turned for raised, turned in zip(a, adjugate, strict=True)
+        )
+        return S11, S12, S22
+
+    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
+        before, after = self.stress(E, up), self.stress(E + change, up)
+        S11, S12, S22 = (b - a for a, b in zip(before, after, strict=True))
+        return S11, S12, S22
+
+    def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        of_square, of_mixed, of_det = self._stiffness(at := _Stretched(E, up))
+        det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
+        T = at.deformed_trace(K)
+        return (of_square * T**2 - of_mixed * T * trace(K, up) - of_det * det) / 2
+
+    def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        of_square, of_mixed, of_det = self._stiffness(at := _Stretched(E, up))
+        T, tau = at.deformed_trace(K), trace(K, up)
+        a, adjugate = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]), (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
+        by_T, by_tau = of_square * T - of_mixed / 2 * tau, -of_mixed / 2 * T
+        M11, M12, M22 = (
+            by_T * raised + by_tau * once - of_det / 2 * turned
+            for raised, once, turned in zip(at.inverse, a, adjugate, strict=True)
+        )
+        return M11, M12, M22
+
+    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        M, (c1, c2) = self.moment(E, K, up), _lowered(across, up)
+        return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
+
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        of_square, of_mixed, _ = self._stiffness(at := _Stretched(E, up))  # c c has no determinant
+        (c1, c2), (a11, a12, a22) = _lowered(across, up), at.inverse
+        T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
+        return of_square * T**2 - of_mixed * T * square
+
+    def _stiffness(self, at: "_Stretched") -> tuple[Scalar, Scalar, Scalar]:
+        """What multiplies T^2, T tr K and det K in twice the energy of bending, T = a^ij K_ij with the deformed a."""
+        factor = self.t**3 * self.h**2 / 18 / at.d**2  # h^2/(12 d) times 4/6 and 1/d
+        one, two, t = 1 - self.number, self.number, 2 + at.T
+        of_det = one + two * (t - _root(at.d))  # W'' has d^2 in place of the root
+        return factor * 2 * (one + two * t), factor * 2 * two, factor * 2 * of_det * at.up / at.d
+
+
+class _Stretched:
+    """A surface with a strain.
+
+    Attributes
+    ----------
+    T, D, d
+        tr C - 2, det(C - 1) and det C = 1 + T + D.
+    first, second
+        I1 - 3 and I2 - 3, in which no numbers of order one are subtracted.
+    up, inverse
+        det up, and the inverse of the deformed metric: 11, 12, 22.
+    """
+
+    def __init__(self, E: Tensor, up: Tensor) -> None:
+        E11, E12, E22 = E[..., 0, 0], E[..., 0, 1], E[..., 1, 1]
+        a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+        self.up = a11 * a22 - a12**2
+        self.T, self.D = 2 * trace(E, up), 4 * self.up * (E11 * E22 - E12**2)
+        area = self.T + self.D
+        self.d = 1 + area
+        self.first = (self.T**2 + self.T * self.D - self.D) / self.d
+        self.second = (area**2 - self.D) / self.d
+        twice = 2 * self.up
+        self.inverse: Components = (
+            (a11 + twice * E22) / self.d,
+            (a12 - twice * E12) / self.d,
+            (a22 + twice * E11) / self.d,
+        )
+
+    def deformed_trace(self, K: Tensor) -> Scalar:
+        a11, a12, a22 = self.inverse
+        return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
+
+
+def _lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
+    """The covector with these components with index up."""
+    a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+    det = a11 * a22 - a12**2
+    return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
+
+
+def _root(x: Scalar) -> Scalar:
+    return ufl.sqrt(x) if isinstance(x, Expr) else x**0.5

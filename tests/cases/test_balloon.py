@@ -1,0 +1,145 @@
+"""Balloons against Adkins and Rivlin's membrane (Phil. Trans. R. Soc. A 244, 1952) by SciPy: shooting from the pole.
+
+With the arc length S of the undeformed meridian, its radius rho(S), the deformed radius r, the slope phi of the
+deformed meridian and the stretches l1 along it and l2 = r/rho around it, the energy W(l1, l2) per undeformed area gives
+
+    (rho W_1)' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   rho W_1 phi' = p l1 r - W_2 sin phi.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from conftest import CASES
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq, fsolve
+
+from magshell_fenicsx import Case, Result
+from magshell_fenicsx.public import run
+
+Numbers = np.ndarray
+
+
+def tensions(first: float, second: float, share: float) -> tuple[float, float]:
+    """W_1 and W_2 over E h, of C01/(C10 + C01) = share."""
+
+    def one(a: float, b: float) -> float:
+        return ((1 - share) * (a - 1 / (a**3 * b**2)) + share * (a * b**2 - 1 / a**3)) / 3
+
+    return one(first, second), one(second, first)
+
+
+class Membrane:
+    """That of a meridian with the radius `rho` and the end S, over R; pressures over E h/R."""
+
+    def __init__(self, rho: Callable[[float], float], end: float, share: float) -> None:
+        self._rho, self._end, self._share = rho, end, share
+
+    def pressure(self, height: float, near: tuple[float, float]) -> float:
+        """With the pole at this height; `near` are a stretch of the pole and a pressure to begin with."""
+
+        def off(unknown: Numbers) -> Numbers:
+            r, z = self._shot(*unknown)
+            return np.array([r - self._rho(self._end), -z - height])
+
+        return float(fsolve(off, near, xtol=1e-10)[1])
+
+    def _shot(self, stretch: float, p: float) -> Numbers:
+        """r at the end, and z from the pole."""
+        share, e = self._share, 1e-4
+        tension = tensions(stretch, stretch, share)[0]
+
+        def rates(S: float, y: Numbers) -> list[float]:
+            force, r, _, phi = y
+            rho = self._rho(S)
+            around = r / rho
+            along = brentq(lambda x: tensions(x, around, share)[0] - force / rho, 1e-3, 1e5)
+            W2 = tensions(along, around, share)[1]
+            return [
+                W2 * np.cos(phi),
+                along * np.cos(phi),
+                -along * np.sin(phi),
+                (p * along * r - W2 * np.sin(phi)) / force,
+            ]
+
+        begin = [e * tension, stretch * e, 0.0, p * stretch**2 * e / (2 * tension)]
+        return np.asarray(solve_ivp(rates, (e, self._end), begin, rtol=1e-9, atol=1e-11).y[1:3, -1])
+
+
+def path(found: Result, rise: float, R_over_h: float) -> CubicSpline:
+    """Pressure from inside over E h/R as a function of the pole's height over the rim."""
+    p_c = 4 / 3 / R_over_h  # over E h/R
+    heights = [rise - float(row["w_pole_over_h"]) / R_over_h for row in found.rows]
+    return CubicSpline(heights, [-float(row["p_over_pc"]) * p_c for row in found.rows])
+
+
+@lru_cache(maxsize=2)
+def disc(share: float) -> Result:
+    """A thin one, R/h = 1000."""
+    law = {"law": "mooney-rivlin", "mooney": share / (1 - share)} if share else {"law": "neo-hookean"}
+    shell = {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.5} | law
+    loading = {"kind": "pressure", "control": "volume", "until": "target", "volume_change": 5, "points": 25}
+    return run({"shell": shell, "boundary": {"rim": "clamped"}, "loading": loading})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 1 / 11])
+def test_flat_disc(share: float) -> None:
+    """To 1e-3 at the heights 0.5, 1 and 1.5 R."""
+    membrane, pressure = Membrane(lambda S: S, 1.0, share), path(disc(share), 0.0, 1000)
+    for height, stretch in ((0.5, 1.2), (1.0, 1.8), (1.5, 3.0 if not share else 2.6)):
+        p = float(pressure(height))
+        assert p == pytest.approx(membrane.pressure(height, (stretch, p)), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_balloon() -> None:
+    """The case "balloon.yaml", a dome of R/h = 100: the largest pressure is that of the membrane to the order h/R."""
+    found = run(Case.load(CASES / "balloon.yaml"))
+    (fold,) = [row for row in found.rows if row["label"] == "fold"]
+    membrane, p = Membrane(np.sin, np.pi / 3, 0.0), -float(fold["p_over_pc"]) * 4 / 3 / 100
+    top = 0.5 - float(fold["w_pole_over_h"]) / 100
+    around = [membrane.pressure(top + d, (1.6, p)) for d in (-0.1, 0.0, 0.1)]
+    assert around[1] > max(around[0], around[2])
+    assert p == pytest.approx(around[1], rel=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 1 / 11])
+def test_closed_sphere(share: float) -> None:
+    """p(lambda) to 1e-4 up to 4, and its folds; half of it, R/h = 1000, whose bending adds parts of 1e-6."""
+    law = {"law": "mooney-rivlin", "mooney": share / (1 - share)} if share else {"law": "neo-hookean"}
+    volume = 4 * np.pi / 3 * (4**3 - 1) / 2
+    found = run(
+        {
+            "shell": {"geometry": "hemisphere", "radius_to_thickness": 1000, "poisson_ratio": 0.5} | law,
+            "points": {"top": [0, 0, 1]},
+            "boundary": {"equator": "symmetry", "top": {"held": ["x", "y"]}},
+            "loading": {
+                "kind": "pressure",
+                "control": "volume",
+                "until": "target",
+                "volume_change": volume,
+                "points": 10,
+            },
+            "mesh": {"refinement": 0.5},
+        }
+    )
+
+    def pressure(stretch: Numbers) -> Numbers:
+        """Over E h/R: (2 mu h/R)(1/l - 1/l^7)(1 + C01/C10 l^2) with C10 = mu/2."""
+        return 2 / 3 * (1 - share + share * stretch**2) * (1 / stretch - stretch**-7.0)
+
+    rows = [row for row in found.rows if row["label"] != "start"]
+    stretch = np.array([1 - float(row["w_pole_over_h"]) / 1000 for row in rows])
+    p = np.array([-float(row["p_over_pc"]) for row in rows]) * 4 / 3 / 1000
+    assert stretch[-1] == pytest.approx(4)
+    assert p == pytest.approx(pressure(stretch), rel=1e-4)
+    folds = [i for i, row in enumerate(rows) if row["label"] == "fold"]
+    slope = CubicSpline(fine := np.linspace(1.2, 4, 20001), pressure(fine)).derivative().roots(extrapolate=False)
+    assert p[folds] == pytest.approx(pressure(slope), rel=1e-6)
+    assert stretch[folds] == pytest.approx(slope, rel=3e-5)  # where dp = 0
+    if not share:
+        assert slope == pytest.approx(7 ** (1 / 6))
