@@ -159,7 +159,7 @@ class Boundary:
         found = self._solved(p, state, phi, _Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
         if isinstance(found, str):
             raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {found}")
-        return found
+        return replace(found, p=p)
 
     def followed(
         self, start: Locus, sense: float, ends: tuple[float, float], steps: int
@@ -190,7 +190,7 @@ class Boundary:
                     yield from self._between(here, *last)
                     yield "end", last[0]
                     return
-            found = "the end of the range is not reached at once"
+            found: Locus | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
                 found = self._at_distance(here, guess, length)
             if isinstance(found, str):
@@ -282,7 +282,7 @@ class Boundary:
         if isinstance(found, str) or found.way.dp * here.way.dp < 0 or self.inner(found.way, here.way) < MOST_TURN:
             return None
         off = Way(found.state.u - guess.du, found.state.mu[self.name] - guess.dmu, 0.0)
-        return None if np.sqrt(self.inner(off, off)) > GAP * high else (found, high)
+        return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(found, p=end), high)
 
     def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
         """Where p turns between two points: the stationary point of the cubic through both, repeated."""
@@ -431,7 +431,7 @@ class _Lines:
 
     def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
         """The derivative by p at fixed u and amplitude."""
-        return np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0)
+        return np.asarray(np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0))
 
     def balance(self, residual: Vector) -> None:
         """Take the residual at a state close by, with the same factors."""
@@ -473,7 +473,7 @@ class _Lines:
         self._largest = dot(comm, np.abs(mixed), np.abs(v))
         mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
         ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
-        by_mu = dot(comm, v, (ahead - back) / (2 * d)) - dot(comm, w, self.K_mu_v)
+        by_mu = dot(comm, v, np.asarray((ahead - back) / (2 * d))) - dot(comm, w, self.K_mu_v)
         load_p = self._by_p(lambda other, amplitudes: other.load(state.u, amplitudes, name))
         by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)
         c = along(mixed)
