@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.boundary import NoSystem
+from magshell_fenicsx.continuation.augmented import NoSystem
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -61,7 +61,7 @@ def instability(records: Sequence[Record]) -> Record:
 
 
 class Varied:
-    """A `continuation.boundary.Family` of scenes.
+    """A `continuation.augmented.Family` of scenes.
 
     Parameters
     ----------
@@ -161,9 +161,7 @@ class Varied:
 
     def amplitudes(self, p: float) -> dict[str, float]:
         """The amplitudes beside that of the instability."""
-        stage = self._base if self.alone else self._stage(p)
-        mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
-        return {name: v for name, v in mu.items() if name != self.name}
+        return self._fixed(self._base if self.alone else self._stage(p), p)
 
     def beside(self, p: float) -> list[tuple[float, float]]:
         """Weights and values of a difference of second order, on the side where values are allowed."""
@@ -181,14 +179,6 @@ class Varied:
                 sign = -1.0
             return [(-1.5 * sign / d, p), (2 * sign / d, p + sign * d), (-0.5 * sign / d, p + 2 * sign * d)]
         return [(0.5 / d, p + d), (-0.5 / d, p - d)]
-
-    def left(self, p: float, state: State) -> State:
-        """A state of the family as one of the model."""
-        return (self._base if self.alone else self._stage(p)).leave(state)
-
-    def scene(self, p: float) -> Scene:
-        """The scene at a value; where only amplitudes depend on it, the one of all."""
-        return (self._base if self.alone else self._stage(p)).scene
 
     def problem(self, p: float) -> Problem:
         """The problem at a value.

@@ -15,7 +15,8 @@ import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label, Locus, NoSystem, Way
+from magshell_fenicsx.continuation.augmented import Locus, NoSystem, Way
+from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.section import in_unit, number_and_unit
