@@ -1,28 +1,21 @@
 """The boundary of stability: a fold or a bifurcation followed in a second number p, through turning points.
 
-A fold is R(u, mu, p) = 0 and g(u, mu, p) = 0, a bifurcation R + beta b = 0, g = 0 and v . R_mu = 0, with g and v of
-`fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. With p unknown too, both are curves, which are followed by arc
-length in (u, mu, p) (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 3 and 4). A
-Newton step takes one factorisation and a back-solve for each of R, R_mu and R_p.
-
-Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at
-which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
+Both are curves in (u, mu, p), see `augmented`, which are followed by arc length; cubics predict. Along folds
+v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at which
+v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import barycentric_interpolate
 
-from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
-from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
-from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, third, times_tangent
-from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way, second_eigenvalue
+from magshell_fenicsx.continuation.fold import AugmentedTangent
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
-Kind = Literal["fold", "bifurcation"]
 Label = Literal["start", "point", "cusp", "turn", "meeting", "end"]
 TOLERANCE = 1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
 LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
@@ -36,81 +29,11 @@ SMALLEST = 1e-4  # of the first step
 SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
 MOST_TRIALS, MOST_POINTS = 12, 400
 MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
-SYMMETRIC = 1e-4  # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
 ROUNDING = 1e-12  # relative, of an amplitude
-SOLVES = 25  # of the power iteration for a second eigenvalue near zero
-
-
-class Family(Protocol):
-    """Systems that differ by a number p, with the same unknowns."""
-
-    def at(self, p: float) -> BorderedNewton:
-        """The solver of the system at p; it may raise `NoSystem`."""
-
-    def amplitudes(self, p: float) -> dict[str, float]:
-        """The amplitudes beside the one that is unknown."""
-
-    def beside(self, p: float) -> Sequence[tuple[float, float]]:
-        """Weights and values of p of a difference: the derivative by p is the weighted sum of what is there."""
-
-
-class NoSystem(RuntimeError):
-    """There is no system at this value of p; the message gives the reason."""
 
 
 class BoundaryLost(RuntimeError):
     """The boundary could not be followed further; the message gives the reason."""
-
-
-@dataclass(frozen=True)
-class Way:
-    """A direction (du, dmu, dp)."""
-
-    du: Vector = field(repr=False)
-    dmu: float
-    dp: float
-
-
-@dataclass(frozen=True)
-class Locus:
-    """A point of a boundary.
-
-    Attributes
-    ----------
-    phi
-        Null vector of K, of length one, the same way along the whole boundary.
-    unstable
-        Number of unstable directions besides `phi`.
-    way
-        Tangent of the boundary, of length one.
-    cubic, pull
-        phi . Pi'''(phi, phi) and phi . R_mu.
-    second
-        The eigenvalue nearest to zero besides that of `phi`, where it was asked for; else NaN.
-    load_error
-        Estimated error of the amplitude.
-    """
-
-    p: float
-    state: State
-    phi: Vector = field(repr=False)
-    unstable: int
-    way: Way
-    cubic: float
-    pull: float
-    second: float
-    load_error: float
-    factorisations: int
-
-
-@dataclass(frozen=True)
-class _Row:
-    """g + c . (du, dmu, dp) = 0, the row that says where on the curve a point is."""
-
-    du: Vector | None
-    dmu: float
-    dp: float
-    value: Callable[[Vector, float, float], float]
 
 
 class Boundary:
@@ -156,10 +79,10 @@ class Boundary:
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
         if self.family.at(p).factor_at(state).skewed:
             raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
-        found = self._solved(p, state, phi, _Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
+        found = self._solved(p, state, phi, Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
         if isinstance(found, str):
             raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {found}")
-        return found
+        return replace(found, p=p)
 
     def followed(
         self, start: Locus, sense: float, ends: tuple[float, float], steps: int
@@ -255,7 +178,7 @@ class Boundary:
         def value(u: Vector, m: float, q: float) -> float:
             return self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
 
-        row = _Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
+        row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
         found = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look)
         if isinstance(found, str):
             return found
@@ -277,12 +200,12 @@ class Boundary:
             low, high = (middle, high) if inside else (low, middle)
         guess = self._ahead(before, here, high)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
-        row = _Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
+        row = Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
         found = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
         if isinstance(found, str) or found.way.dp * here.way.dp < 0 or self.inner(found.way, here.way) < MOST_TURN:
             return None
         off = Way(found.state.u - guess.du, found.state.mu[self.name] - guess.dmu, 0.0)
-        return None if np.sqrt(self.inner(off, off)) > GAP * high else (found, high)
+        return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(found, p=end), high)
 
     def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
         """Where p turns between two points: the stationary point of the cubic through both, repeated."""
@@ -332,20 +255,18 @@ class Boundary:
         return replace(found, p=p, state=found.state.with_(found.state.u, mu, load), load_error=error)
 
     def _solved(
-        self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool = False
+        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool = False
     ) -> Locus | str:
         """The point near a guess on which a row holds, or the reason why there is none."""
         return self._recorded(lambda: self._by_newton(p, state, b, row, near, look=look))
 
-    def _by_newton(
-        self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool
-    ) -> Locus | str:
+    def _by_newton(self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool) -> Locus | str:
         try:
             return self._iterated(float(p), state, b, row, near, look=look)
         except NoSystem as e:
             return str(e)
 
-    def _iterated(self, p: float, state: State, b: Vector, row: _Row, near: Locus | None, *, look: bool) -> Locus | str:
+    def _iterated(self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool) -> Locus | str:
         u, mu, name = state.u, float(state.mu[self.name]), self.name
         beside = self.family.beside(p)
         sizes, changes = list[float](), list[float]()
@@ -354,7 +275,7 @@ class Boundary:
             system, here = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
                 tangent = AugmentedTangent(newton, here, b)
-                lines = _Lines(system, here, name, tangent, self.family, beside, self.scales)
+                lines = Lines(system, here, name, tangent, self.family, beside, self.scales)
                 way = lines.step(self.kind, row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"
@@ -397,98 +318,10 @@ class Boundary:
             way=Way(direction.du / norm, direction.dmu / norm, direction.dp / norm),
             cubic=dot(system.comm, lines.cubic, tangent.v) / scale**3,
             pull=lines.t_mu / scale,
-            second=_second(tangent, system) if look else np.nan,
+            second=second_eigenvalue(tangent, system) if look else np.nan,
             load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
             factorisations=len(sizes),
         )
-
-
-class _Lines:
-    """The rows of Newton's step at a state, with what its columns take: du = alpha v - w_R - dmu w_mu - dp w_p."""
-
-    def __init__(
-        self,
-        system: System,
-        state: State,
-        name: str,
-        tangent: AugmentedTangent,
-        family: Family,
-        beside: Sequence[tuple[float, float]],
-        scales: tuple[float, float],
-    ) -> None:
-        self._scales, self._largest = scales, 0.0
-        self._system, self._state, self._name, self._tangent = system, state, name, tangent
-        own = {name: state.mu[name]}
-        self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
-        v, u = tangent.v, state.u
-        self.w_R, self.t_R = tangent.solve(system.residual(u, state.mu))
-        self._R_mu = system.load(u, state.mu, name)
-        self.w_mu, self.t_mu = tangent.solve(self._R_mu)
-        self.w_p, self.t_p = tangent.solve(self._by_p(lambda other, mu: other.residual(u, mu)))
-        self.cubic = third(system, state, v)
-        self.K_mu_v = first_difference(lambda x: system.load(x, state.mu, name), system, u, v)
-        self.K_p_v = self._by_p(lambda other, mu: times_tangent(other, State(u, mu), v))
-
-    def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
-        """The derivative by p at fixed u and amplitude."""
-        return np.asarray(np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0))
-
-    def balance(self, residual: Vector) -> None:
-        """Take the residual at a state close by, with the same factors."""
-        self.w_R, self.t_R = self._tangent.solve(residual)
-
-    def step(self, kind: Kind, row: _Row, value: float | None, *, settled: bool = False) -> Way:
-        """Newton's step to the point on which a row has the value zero; without a value the tangent of the curve.
-
-        `settled` takes only the residual and the row as not yet zero.
-        """
-        comm, v, t = self._system.comm, self._tangent.v, self._tangent
-        w_R, t_R = (self.w_R, self.t_R) if value is not None else (0.0 * v, 0.0)
-        g, pull = (t.g, self.t_mu) if value is not None and not settled else (0.0, 0.0)
-
-        def along(c: Vector) -> list[float]:
-            """What c . du has of dmu, dp, alpha and of R."""
-            return [-dot(comm, c, self.w_mu), -dot(comm, c, self.w_p), dot(comm, c, v), -dot(comm, c, w_R)]
-
-        on_v, on_mu = along(self.cubic), dot(comm, v, self.K_mu_v)
-        singular = [on_v[0] + on_mu, on_v[1] + dot(comm, v, self.K_p_v), on_v[2], on_v[3] - g]
-        own = [self.t_mu, self.t_p, -t.g, t_R] if kind == "fold" else self._without_work(along, pull)
-        c = along(row.du) if row.du is not None else [0.0] * 4
-        place = [c[0] + row.dmu, c[1] + row.dp, c[2], c[3] + value if value is not None else -1.0]
-        rows = np.array([singular, own, place])
-        columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
-        rows[:, :3] *= columns
-        size = np.abs(rows[:, :3]).max(axis=1)
-        if kind == "bifurcation":
-            size[1] = max(size[1], self._largest * columns[2])
-        rows /= np.where(size, size, 1.0)[:, None]
-        dmu, dp, alpha = columns * np.linalg.lstsq(rows[:, :3], -rows[:, 3], SYMMETRIC if kind != "fold" else None)[0]
-        return Way(alpha * v - w_R - dmu * self.w_mu - dp * self.w_p, float(dmu), float(dp))
-
-    def _without_work(self, along: Callable[[Vector], list[float]], pull: float) -> list[float]:
-        """The row v . R_mu = 0, with v' = -K^-1 K' v."""
-        system, state, name, comm = self._system, self._state, self._name, self._system.comm
-        v, w = self._tangent.v, self.w_mu
-        mixed = mixed_third(system, state, v, w) - self.K_mu_v
-        self._largest = dot(comm, abs(mixed), np.asarray(abs(v), dtype=np.float64))
-        mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
-        ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
-        by_mu = dot(comm, v, (ahead - back) / (2 * d)) - dot(comm, w, self.K_mu_v)
-        load_p = self._by_p(lambda other, amplitudes: other.load(state.u, amplitudes, name))
-        by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)
-        c = along(mixed)
-        return [by_mu - c[0], by_p - c[1], -c[2], pull - c[3]]
-
-
-def _second(tangent: AugmentedTangent, system: System) -> float:
-    """The eigenvalue of K nearest to zero across b, by a power iteration of the bordered inverse."""
-    x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)
-    value = np.nan
-    for _ in range(SOLVES):
-        y, _ = tangent.solve(x)
-        value = dot(system.comm, x, x) / dot(system.comm, x, y)
-        x = y / np.sqrt(dot(system.comm, y, y))
-    return float(value)
 
 
 def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.boundary import NoSystem
+from magshell_fenicsx.continuation.augmented import NoSystem
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -28,7 +28,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import stage_at
 from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.steps import LOCATED
-from magshell_fenicsx.simulate.transfer import chart, transfer
+from magshell_fenicsx.simulate.transfer import transfer
 
 Array = NDArray[np.float64]
 Again = Callable[[float], Problem]
@@ -61,7 +61,7 @@ def instability(records: Sequence[Record]) -> Record:
 
 
 class Varied:
-    """A `continuation.boundary.Family` of scenes.
+    """A `continuation.augmented.Family` of scenes.
 
     Parameters
     ----------
@@ -93,13 +93,40 @@ class Varied:
         self._again, self._ends, self._record = again, ends, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}
+        self._line: tuple[float, dict[str, float], dict[str, float]] | None = None
         self._refuse_unknown(scene)
         self._origin, self.alone = scene, False
-        self._nodes = chart(self._scene(value))
-        self._value, base = value, self._scene(value)
+        self._aside = self._value_aside(value)
+        base = self._origin if self._origin is not scene else self._scene(value)
         self._first = replace(record, point=replace(record.point, state=self._state_in(base, value)))
         self._stages[value] = self._base = stage_at(base, self._first)
         self.alone = self._by_amplitudes_alone(value)
+        self._line = self._affine(value, self._aside) if self.alone else None
+
+    def _affine(self, a: float, b: float) -> tuple[float, dict[str, float], dict[str, float]] | None:
+        """A value, the amplitudes there and their rates, if they are linear in the value: no problem is made then."""
+        low, middle, high = (self._mu(p) for p in (a, (a + b) / 2, b))
+        if all(isclose(2 * middle[name], low[name] + high[name], rel_tol=1e-12, abs_tol=1e-300) for name in low):
+            return a, low, {name: (high[name] - low[name]) / (b - a) for name in low}
+        return None
+
+    def _value_aside(self, value: float) -> float:
+        """Another value, to compare forces there. A term that is zero at the start, as a field may be, is there."""
+        low, high = self._ends
+        step = ASIDE * (high - low)
+        others = [other for other in (value + step, value - step) if low <= other <= high]
+        names = self._origin.unloaded().mu.keys()
+        scenes = {other: self._scene(other) for other in others}
+        own = {other: made.unloaded().mu.keys() for other, made in scenes.items()}
+        aside = max(others, key=lambda other: len(own[other]))
+        if own[aside] > names:  # its scene serves all values
+            u, mu = transfer(self._origin, scenes[aside], self._record.point.state.u), dict(self._record.point.state.mu)
+            self._origin = scenes[aside]
+            new = {name: self._origin.problem.lambda_m if name == "lambda_m" else 0.0 for name in own[aside] - names}
+            point = replace(self._record.point, state=State(u, mu | new))
+            self._record = replace(self._record, point=point, step=len(self._origin.problem.programme))
+            return min(others, key=lambda other: other == aside) if len(others) > 1 else (value + aside) / 2
+        return aside
 
     def _refuse_unknown(self, scene: Scene) -> None:
         record, programme = self._record, scene.problem.programme
@@ -134,13 +161,13 @@ class Varied:
 
     def amplitudes(self, p: float) -> dict[str, float]:
         """The amplitudes beside that of the instability."""
-        stage = self._base if self.alone else self._stage(p)
-        mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
-        return {name: v for name, v in mu.items() if name != self.name}
+        return self._fixed(self._base if self.alone else self._stage(p), p)
 
     def beside(self, p: float) -> list[tuple[float, float]]:
         """Weights and values of a difference of second order, on the side where values are allowed."""
         d = STEP * abs(self._ends[1] - self._ends[0])
+        if self._line:
+            return [(0.5 / d, p + d), (-0.5 / d, p - d)]
         try:
             for q in (p - d, p + d):
                 self.problem(q)
@@ -152,14 +179,6 @@ class Varied:
                 sign = -1.0
             return [(-1.5 * sign / d, p), (2 * sign / d, p + sign * d), (-0.5 * sign / d, p + 2 * sign * d)]
         return [(0.5 / d, p + d), (-0.5 / d, p - d)]
-
-    def left(self, p: float, state: State) -> State:
-        """A state of the family as one of the model."""
-        return (self._base if self.alone else self._stage(p)).leave(state)
-
-    def scene(self, p: float) -> Scene:
-        """The scene at a value; where only amplitudes depend on it, the one of all."""
-        return (self._base if self.alone else self._stage(p)).scene
 
     def problem(self, p: float) -> Problem:
         """The problem at a value.
@@ -206,6 +225,9 @@ class Varied:
 
     def _mu(self, p: float) -> dict[str, float]:
         """The amplitudes of the model at the instability, those that are given being those of another problem."""
+        if self._line:
+            at, known, rates = self._line
+            return {name: v + rates[name] * (p - at) for name, v in known.items()}
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
         for before, after in zip(old.programme[: self._record.step - 1], new.programme, strict=False):
             one, two = before.load.target, after.load.target
@@ -226,9 +248,7 @@ class Varied:
         NoInfluence
             If they are the same.
         """
-        low, high = self._ends
-        other = value + ASIDE * (high - low) if value + ASIDE * (high - low) <= high else value - ASIDE * (high - low)
-        (state, phi), comm = self.start(), self._origin.model.system.comm
+        other, (state, phi), comm = self._aside, self.start(), self._origin.model.system.comm
         own = {self.name: state.mu[self.name]}
 
         def forces(stage: Stage, p: float) -> Vector:

@@ -15,7 +15,8 @@ import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label, Locus, NoSystem, Way
+from magshell_fenicsx.continuation.augmented import Locus, NoSystem, Way
+from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -172,17 +173,18 @@ def boundary(
     span = parse_range(over)
     source = from_first(comm, lambda: read_source(Path(file), settings))
     folder, name = given_folder(out), Path(file).name
+    once: Say = say if comm.rank == 0 else lambda line: None
     with FOLDER.held(folder, comm, name):
         journal = partial(_Journal, folder / "points", _identity(source, span, made))
         value = _value(source, span, made)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say))
         if begin["mode"] == "antisymmetric":
-            say("the instability is antisymmetric: the whole shell is modelled")
+            once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say))
         if not begin["label"]:
             instability([])
-        say(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
+        once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
         def followed(sense: int) -> Iterator[str]:
@@ -197,7 +199,7 @@ def boundary(
         done = _put_together(found, begin, span, name, settings)
         by_first(comm, lambda: _write(done, folder))
     for line in done.content["said"]:
-        say(line)
+        once(line)
     return done
 
 

@@ -118,3 +118,11 @@ def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:
 def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], said: str) -> None:
     with pytest.raises(CaseError, match=said):
         ms.boundary(ARCH, over, settings, tmp_path / "b")
+
+
+def test_through_a_field_of_zero(tmp_path: Path) -> None:
+    """Where the case starts; at the ends against the axisymmetric reference of tests/cases/test_cases.py."""
+    found = ms.boundary(CASES / "dimple_buckling.yaml", "magnetic.lambda_m=-0.00184:0.00184:3", out=tmp_path / "b")
+    ends = {row["key"]: row["load"] for row in (found.rows[0], found.rows[-1])}
+    assert ends == pytest.approx({-0.00184: 0.120723848, 0.00184: 0.552053778}, rel=1e-6)
+    assert not found.special

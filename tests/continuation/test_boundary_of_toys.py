@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from continuation.toys import Toy
 
-from magshell_fenicsx.continuation.boundary import Boundary, Kind, Label, Locus
+from magshell_fenicsx.continuation.augmented import Kind, Locus
+from magshell_fenicsx.continuation.boundary import Boundary, Label
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 
