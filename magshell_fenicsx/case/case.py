@@ -140,7 +140,7 @@ class Case(WithParts):
             )
         if self.magnetic and self.magnetic.energy != "full" and self.shell.law != "koiter":
             raise ValueError(
-                f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; with "
+                f"magnetic.energy: {self.magnetic.energy}: the expansions have a thickness that does not change; with "
                 f"shell.law: {self.shell.law} give full"
             )
         layers = self.magnetic.remanent.layers if self.magnetic else None

@@ -71,7 +71,9 @@ class ShellKeys(Section):
     @model_validator(mode="after")
     def _law_fits(self) -> Self:
         if (self.mooney is not None) != (self.law == "mooney-rivlin"):
-            raise ValueError(f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}")
+            raise ValueError(
+                f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}"
+            )
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
         return self

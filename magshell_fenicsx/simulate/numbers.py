@@ -18,7 +18,15 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.problem.wanted import FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
-OF_MATERIAL = ("density", "mooney", "poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")
+OF_MATERIAL = (
+    "density",
+    "mooney",
+    "poisson_ratio",
+    "radius_to_thickness",
+    "thickness",
+    "youngs_modulus",
+    "thickness_factor",
+)
 ELSEWHERE = ("mesh", "loading", "points", "boundary", "stability", "frequencies", "gradients", "ensemble", "design")
 
 

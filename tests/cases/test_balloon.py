@@ -1,7 +1,7 @@
 """Balloons against Adkins and Rivlin's membrane (Phil. Trans. R. Soc. A 244, 1952) by SciPy: shooting from the pole.
 
-With the arc length S of the undeformed meridian, its radius rho(S), the deformed radius r, the slope phi of the deformed
-meridian and the stretches l1 along it and l2 = r/rho around it, the energy W(l1, l2) per undeformed area gives
+With the arc length S of the undeformed meridian, its radius rho(S), the deformed radius r, the slope phi of the
+deformed meridian and the stretches l1 along it and l2 = r/rho around it, the energy W(l1, l2) per undeformed area gives
 
     (rho W_1)' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   rho W_1 phi' = p l1 r - W_2 sin phi.
 """

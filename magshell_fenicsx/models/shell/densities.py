@@ -28,7 +28,7 @@ def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr
 
 
 def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
-    """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to the stress: what it adds to the energy of v."""
+    """S : (v_i . v_j)/2, the energy that v gains by the stress S of a change E_11, E_12, E_22 of the strain."""
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     present = kin.membrane_strain(r0, u)
     if natural is None:
@@ -45,9 +45,7 @@ def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
     return natural.area * law.thicker(natural.thickness).bending(E - natural.strain, K - natural.bend, natural.up)
 
 
-def normal_moment(
-    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None
-) -> tuple[Expr, Expr]:
+def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None) -> tuple[Expr, Expr]:
     """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a penalty."""
     E, K = kin.membrane_strain(r0, u), kin.curvature_change(r0, u)
     if natural is None:

@@ -186,7 +186,9 @@ class EnergyFactory:
             for name, of in magnetic_densities(field.law, field.energy, thins=thins).items()
         ]
         if field.gradient is not None:
-            density = self._magnetised(field, densities.in_gradient(full), Br, self._constant(field.gradient), parts=MOVED)
+            density = self._magnetised(
+                field, densities.in_gradient(full), Br, self._constant(field.gradient), parts=MOVED
+            )
             terms.append(carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
 
