@@ -29,7 +29,7 @@ def account(
         Number of different rims beside the pole.
     """
     body = body_of(context)
-    included = [model, _elastic(body) if body else "membrane and bending energy"]
+    included = [model, _elastic(body) if body else _of_shell(context)]
     left_out = list[str]()
     for room in accounts(context, loads):
         included += room.included
@@ -71,6 +71,14 @@ def _imperfections(context: Context, rims: int) -> str:
         why = "of a mesh file" if read else f"of more than {MOST_RIMS}"
         beside = f"; elements lie across the rims of dimples, {why}: k_d is then less exact"
     return f"imperfections: {', '.join(words)}{beside}"
+
+
+def _of_shell(context: Context) -> str:
+    rubber = context.shell.rubber
+    if rubber is None:
+        return "membrane and bending energy"
+    law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"
+    return f"membrane and bending energy of incompressible rubber at any stretch ({law}); its thickness follows"
 
 
 def _elastic(body: Body) -> str:
