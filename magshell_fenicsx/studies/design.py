@@ -7,7 +7,7 @@ and goes on where it was interrupted.
 import hashlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -35,7 +35,7 @@ from magshell_fenicsx.simulate.gradients.results import vibration_at_end
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate
-from magshell_fenicsx.studies.design_picture import draw_design, reached_shape
+from magshell_fenicsx.studies.design_picture import Reached, draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
 from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
 from magshell_fenicsx.studies.points import identity
@@ -234,11 +234,15 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
     for target in wanted.targets.values():
-        by_first(comm, lambda target=target: drawn(reached_shape(folder / "verified", target)))
+        by_first(comm, partial(_draw_reached, drawn, folder / "verified", target))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
     return content
+
+
+def _draw_reached(drawn: Callable[[Reached | None], None], folder: Path, target: Target) -> None:
+    drawn(reached_shape(folder, target))
 
 
 def _optimised(made: Design) -> tuple[Evaluation, Evaluation, Array, str]:

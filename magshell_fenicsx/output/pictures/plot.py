@@ -170,9 +170,9 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         curve = curve_figure(run.rows, amplitude, style, run.place)
         if shapes:
             with drawing(style):
-                shells = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
+                chosen = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
                 parts = worth_drawing(drawn_parts(run.rows, amplitude))
-                add_shapes(curve, parts, shells, style, run.camera)
+                add_shapes(curve, parts, chosen, style, run.camera)
         yield from written(curve, style, "curve")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
