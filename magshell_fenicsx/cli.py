@@ -109,9 +109,7 @@ def run(
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
     ] = None,
-    pictures: Annotated[
-        bool, typer.Option(" /--no-pictures", show_default=False, help="draw none; magshell plot draws them later")
-    ] = True,
+    pictures: Annotated[bool, typer.Option(" /--no-pictures", show_default=False, help="plot draws them later")] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.opened import opened
@@ -329,9 +327,7 @@ def plot(
     folders: Runs,
     point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
     animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
-    shapes: Annotated[
-        str | None, typer.Option(metavar="N,N", help="put the shell at these points on the curve")
-    ] = None,
+    shapes: Annotated[str | None, typer.Option(metavar="N,N", help="put these points' shells on the curve")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")] = False,
     out: Annotated[Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")] = Path(
         "curves.png"
@@ -350,21 +346,14 @@ def plot(
     ] = None,
 ) -> None:
     """Draw the pictures and write the report of a run again, from its folder; of several runs their curves in one."""
-    from magshell_fenicsx.input.source import CaseError
-    from magshell_fenicsx.output.pictures.plot import plot as plot_again
-    from magshell_fenicsx.output.pictures.plot import plot_runs
+    from magshell_fenicsx.output.pictures.plot import plotted
 
     if world().rank:
         return
     with exit_codes(stopped=(OSError,)):
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
-        if len(folders) > 1:
-            if point is not None or animation or shapes or whole:
-                raise CaseError("plot: of several runs the curves are drawn in one picture: give one folder for more")
-            print_line(", ".join(plot_runs(folders, out, options)))
-            return
-        drawn = plot_again(folders[0], point, animation, options, points_of(shapes), whole)
-    print_line(f"{', '.join(drawn)} in {folders[0]}/")
+        alone = {"point": point, "animation": animation, "shapes": points_of(shapes), "whole": whole}
+        print_line(plotted(folders, out, options, **alone))
 
 
 @app.command()

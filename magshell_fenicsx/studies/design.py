@@ -34,7 +34,7 @@ from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_en
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate
-from magshell_fenicsx.studies.design_picture import draw_design, reached_shape
+from magshell_fenicsx.studies.design_picture import Reached, draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
 from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
 from magshell_fenicsx.studies.points import identity
@@ -238,6 +238,10 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     if missed := wanted.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
     return content
+
+
+def _draw_reached(drawn: Callable[[Reached | None], None], folder: Path, target: Target) -> None:
+    drawn(reached_shape(folder, target))
 
 
 def _optimised(made: Design) -> tuple[Evaluation, Evaluation, Array, str]:

@@ -120,7 +120,7 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
         own = poles[start : start + n]
         numbers = triangles[first_one : first_one + m] - start
         if numbers.size and not 0 <= numbers.min() <= numbers.max() < n:
-            raise ValueError("a face has no corners")
+            raise IndexError(name)
         found.append(Solid(points[start : start + n], numbers, name, own if own.any() else None))
         start, first_one = start + n, first_one + m
     return lines, tuple(found)

@@ -42,7 +42,7 @@ class Laid:
         alpha = over + below
         mixed = over[..., None] * self.image[..., :3] + below[..., None] * under[..., :3]
         colours = np.where(alpha[..., None] > 0, mixed / np.maximum(alpha, 1e-9)[..., None], 255.0)
-        return np.asarray(np.rint(np.concatenate([colours, 255 * alpha[..., None]], axis=-1)), dtype=np.uint8)
+        return np.asarray(np.rint(np.concatenate([colours, 255 * alpha[..., None]], axis=-1)), np.uint8)
 
 
 class Beside:

@@ -172,7 +172,7 @@ def draw_hidden(axes: "Axes", of: Part) -> None:
     """Draw an unstable part that its marks hide once more in an inset, in the corner with the least of the curves."""
     if (box := hidden(axes, of)) is None:
         return
-    points = np.concatenate([np.asarray(line.get_xydata()) for line in axes.lines])
+    points = drawn_points(axes)
     inside = axes.transAxes.inverted().transform(axes.transData.transform(points))
     gap = 0.14  # room for the numbers of the inset
     corners = [(x, y) for y in (gap, 0.97 - INSET) for x in (0.97 - INSET, gap)]
@@ -187,6 +187,11 @@ def draw_hidden(axes: "Axes", of: Part) -> None:
     small.tick_params(labelsize="x-small", length=2)
     small.locator_params(nbins=3)
     axes.indicate_inset_zoom(small, edgecolor="0.4", linewidth=0.6)
+
+
+def drawn_points(axes: "Axes") -> Array:
+    """The places (n, 2) of all lines in axes."""
+    return np.concatenate([np.asarray(line.get_xydata(), float).reshape(-1, 2) for line in axes.lines])
 
 
 def _once(axes: "Axes", name: str) -> str:

@@ -87,15 +87,30 @@ def plot(
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
     drawn = draw(folder, point, options, shapes)
-    if whole:
-        drawn += [f"fields/{name}" for name in write_whole_shells(folder)]
+    more = [f"fields/{name}" for name in write_whole_shells(folder)] if whole else []
+    drawn += more[-1:]  # the list of the others
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
         write_report(folder)
         drawn.append("report.html")
-    note(folder, drawn)
+    note(folder, [*drawn, *more])
     return drawn
+
+
+def plotted(folders: Sequence[Path], out: Path, options: Mapping[str, Any], **alone: Any) -> str:
+    """Draw one run again, as `plot`, or the curves of several; the files in words.
+
+    Raises
+    ------
+    CaseError
+        Of several runs with arguments `alone`, which are for one.
+    """
+    if len(folders) == 1:
+        return f"{', '.join(plot(folders[0], options=options, **alone))} in {folders[0]}/"
+    if any(value is not None and value is not False and value != [] for value in alone.values()):
+        raise CaseError("plot: of several runs the curves are drawn in one picture: give one folder for more")
+    return ", ".join(plot_runs(folders, out, options))
 
 
 def plot_runs(folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None) -> list[str]:
@@ -170,9 +185,9 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         curve = curve_figure(run.rows, amplitude, style, run.place)
         if shapes:
             with drawing(style):
-                shells = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
+                chosen = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
                 parts = worth_drawing(drawn_parts(run.rows, amplitude))
-                add_shapes(curve, parts, shells, style, run.camera)
+                add_shapes(curve, parts, chosen, style, run.camera)
         yield from written(curve, style, "curve")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.curve import MARK, draw_lines, legend
+from magshell_fenicsx.output.pictures.curve import MARK, draw_lines, drawn_points, legend
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, drawing
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, named, place
 from magshell_fenicsx.output.pictures.picture import Background
@@ -142,29 +142,25 @@ def add_shapes(
         at = np.array(place(row, parts[number].amplitude))
         corner = _free(axes, at, size, taken.setdefault(number, []))
         taken[number].append(np.array([corner, corner + size]))
-        middle = (float(corner[0] + size[0] / 2), float(corner[1] + size[1] / 2))
+        x, y = corner + size / 2
         shown = OffsetImage(image, zoom=72 / figure.dpi, resample=True)
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkB": MARK / 2}
-        axes.add_artist(
-            AnnotationBbox(
-                shown,
-                (at[0], at[1]),
-                middle,
-                boxcoords="axes fraction",
-                frameon=False,
-                pad=0,
-                arrowprops=line,
-                zorder=3,
-            )
-        )
+        ends = (float(at[0]), float(at[1])), (float(x), float(y))
+        how: dict[str, Any] = {
+            "boxcoords": "axes fraction",
+            "frameon": False,
+            "pad": 0,
+            "arrowprops": line,
+            "zorder": 3,
+        }
+        axes.add_artist(AnnotationBbox(shown, *ends, **how))
         axes.plot(*at, "o", color="k", markersize=MARK, zorder=5)
 
 
 def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array:
     """The lower left corner of a box, in parts of the axes, that covers little and is near its point."""
     inside = axes.transAxes.inverted().transform
-    curves = np.concatenate([np.asarray(line.get_xydata()) for line in axes.lines])
-    points = inside(axes.transData.transform(curves))
+    points = inside(axes.transData.transform(drawn_points(axes)))
     target = inside(axes.transData.transform(at))
 
     def fault(low: Array) -> float:
