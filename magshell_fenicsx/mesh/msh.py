@@ -92,9 +92,9 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
         return bool(2 * same < whole)
     a, b, c = (nodes[cells[:, i]] - nodes.mean(axis=0) for i in range(3))
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
-    size = np.ptp(nodes, axis=0).max()
-    for sense, scale in ((vectors[:, 2], 1.0), (vectors[:, 1], 1.0), (vectors[:, 0], 1.0), ((a * vectors).sum(1), size)):
-        if abs(total := sense.sum()) > TIE * whole * scale:
+    outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
+    for along in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
+        if abs(total := along.sum()) > TIE * whole:
             return bool(total < 0)
     return False
 
