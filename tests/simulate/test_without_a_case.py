@@ -210,6 +210,68 @@ def test_what_does_not_fit_is_refused(dome: Dome) -> None:
         ms.Scene(CASES / "dimple_buckling.yaml", terms=[term])
 
 
+def cap(*parts: Any, **sections: Any) -> Any:
+    """A problem without a mesh, of which only the words count."""
+    shell = ms.Shell("cap", polar=40, radius=1.0, thickness=0.02, poisson_ratio=0.3)
+    return ms.Problem(shell, ms.Clamped("rim"), *parts, **sections)
+
+
+def test_what_is_given_twice_is_refused() -> None:
+    """The later of two values would win without a word."""
+    field = ms.Field([0, 0, 1], [1, 0, 0], lambda_m=1e-3)
+    twice = [
+        ((ms.Hinged("rim"),), {}, "boundary.rim: is given twice, as clamped and as hinged"),
+        ((field, ms.Field([0, 0, 1], [1, 0, 0], lambda_m=2e-3)), {}, "magnetic.lambda_m: is given twice, as 0.001 and"),
+        ((ms.Section("shell", poisson_ratio=0.4),), {}, "shell.poisson_ratio: is given twice, as 0.3 and as 0.4"),
+        ((ms.Pressure(),), {"loading": {"kind": "pressure"}}, "loading: is given twice, as steps and as a section"),
+        ((), {"degree": 3, "mesh": {"degree": 4}}, "mesh.degree: is given twice, as 4 and as 3"),
+        ((), {"degree": 3, "mesh": 1}, "mesh: 1: must be a section, with keys below it"),
+    ]
+    for parts, sections, said in twice:
+        with pytest.raises(ms.CaseError, match=rf"^Problem: {re.escape(said)}"):
+            cap(*parts, **sections)
+    assert cap(field, field, ms.Clamped("rim")).lambda_m == 1e-3
+
+
+def test_a_vector_that_is_zero_has_no_direction() -> None:
+    """With `lambda_m` vectors are over their magnitudes: zero is no field, and not one along e3."""
+
+    def pulled(remanent: Any, applied: Any) -> float:
+        *_, record = ms.follow(cap(ms.Field(remanent, applied, lambda_m=1e-3), ms.Step("field", points=1)))
+        return float(np.abs(record.point.state.u).max())
+
+    assert pulled([0, 0, 1], [0, 0, 1]) > 1e-4
+    assert pulled([0, 0, 0], [0, 0, 1]) < 1e-15
+    assert pulled([0, 0, 1], np.zeros(3)) < 1e-15
+
+
+def test_what_is_no_vector_and_no_shell(dome: Dome) -> None:
+    for vector in (1.0, None, [0, 1], np.eye(3)):
+        with pytest.raises(ms.CaseError, match=r"^Problem: magnetic\.remanent: .*: a vector has three|numbers or form"):
+            cap(ms.Field(vector, [0, 0, 1], lambda_m=1e-3))
+    with pytest.raises(ms.CaseError, match=r"magnetic\.lambda_m: 'abc': must be a valid number"):
+        cap(ms.Field([0, 0, 1], [0, 0, 1], lambda_m="abc"))  # type: ignore[arg-type]
+    with pytest.raises(ms.CaseError, match=r"the first argument is what ms\.Shell gives"):
+        ms.Problem(dome[0], ms.Clamped("rim"))  # type: ignore[arg-type]
+    with pytest.raises(ms.CaseError, match=r"shell\.geometry: the surface is the mesh; leave it out"):
+        shell(dome, geometry="disc")
+    one = function(dome, ("Lagrange", 1), lambda x: 1 + 0 * x[0])
+    with pytest.raises(ms.CaseError, match=r"^Problem: foundation\.factor: a function on the mesh: must be"):
+        ms.Problem(shell(dome), ms.Clamped("rim"), ms.Section("foundation", stiffness=1.0, factor=one))
+
+
+def test_terms_whose_value_is_none() -> None:
+    def bed(r0: Any, u: Any) -> Any:
+        return ufl.dot(u.r, u.r) / 2
+
+    for value in (np.nan, np.inf, "1e-4", None):
+        with pytest.raises(ValueError, match=r"bed: value: .*: must be a finite number"):
+            ms.OwnTerm("bed", bed, value=value)
+    with pytest.raises(ValueError, match=r"bed: on: \['a', 'b'\]: must be the name of one edge"):
+        ms.OwnTerm("bed", bed, on=["a", "b"])  # type: ignore[arg-type]
+    assert ms.OwnTerm("bed", bed, value=np.float64(2)).value == 2
+
+
 def folds(folder: Path, ranks: int) -> tuple[float, float]:
     """Pressure at the fold and integral of |u|^2 there, of the program in howto.md."""
     (program,) = re.findall(r"```python\n(import gmsh\n.*?)```", HOWTO.read_text("utf-8"), re.DOTALL)
