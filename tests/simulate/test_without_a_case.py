@@ -106,6 +106,14 @@ def test_thickness_as_a_function(dome: Dome) -> None:
     close(path(dome, thickness_factor=function(dome, ("DG", 0), lambda x: 1 + 0 * x[0])), path(dome))
 
 
+def test_a_thickness_that_is_negative_between_the_nodes_of_the_displacement(dome: Dome) -> None:
+    """Quadratic in each triangle, one at its vertices and less than zero at the middle of a side."""
+    thin = function(dome, ("DG", 2), lambda x: 1 + 0 * x[0])
+    thin.x.array[3::6] = -0.02
+    with pytest.raises(MeshError, match=r"shell\.thickness_factor: is not within 0\.001 to 1000 at"):
+        ms.Scene(ms.Problem(shell(dome, thickness_factor=thin), ms.Clamped("rim"), degree=3), MPI.COMM_SELF)
+
+
 def test_remanence_as_a_function(dome: Dome) -> None:
     remanent = function(dome, ("DG", 2, (3,)), lambda x: 0.06 * np.stack([x[1] / R, 0 * x[0], 1 + x[0] / R]))
     formulas = ["0.06*y", "0", "0.06*(1 + x)"]
