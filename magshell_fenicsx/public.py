@@ -51,6 +51,12 @@ def problem_of(given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[Ow
         raise type(e)(case.placed(str(e))) from None
 
 
+def processes(given: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
+    """Those that were asked for; else those of the mesh of a problem, or all."""
+    known = given.given if isinstance(given, Problem) else None
+    return comm or (known.home.comm if known and known.home else MPI.COMM_WORLD)
+
+
 class Scene(SceneOfProblem):
     """A problem ready to be solved.
 
@@ -58,6 +64,8 @@ class Scene(SceneOfProblem):
     ----------
     case
         A problem, or what makes one; see `problem_of`.
+    comm
+        The processes; by default those of the mesh that a program gave, or all.
     plan
         The name of a problem in earlier versions.
     terms
@@ -67,13 +75,14 @@ class Scene(SceneOfProblem):
     def __init__(
         self,
         case: Given,
-        comm: MPI.Comm = MPI.COMM_WORLD,
+        comm: MPI.Comm | None = None,
         plan: Problem | None = None,
         *,
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         if plan is not None:
             warn("Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2)
+        comm = processes(plan or case, comm)
         super().__init__(plan or problem_of(case, comm, terms), comm)
         self._given = case
 
@@ -93,11 +102,8 @@ def follow(
     A problem on a mesh of a program is solved by the processes of that mesh. For all else see
     `simulate.follow.follow`.
     """
-    if isinstance(given, SceneOfProblem):
-        return follow_scene(given, search=search, remark=remark)
-    problem = problem_of(given)
-    home = problem.given and problem.given.home
-    return follow_scene(Scene(problem, home.comm if home else MPI.COMM_WORLD), search=search, remark=remark)
+    scene = given if isinstance(given, SceneOfProblem) else Scene(given)
+    return follow_scene(scene, search=search, remark=remark)
 
 
 def boundary(
@@ -117,7 +123,7 @@ def boundary(
 def run(
     case: Given,
     out: Path | str | None = None,
-    comm: MPI.Comm = MPI.COMM_WORLD,
+    comm: MPI.Comm | None = None,
     say: Say = lambda line: None,
     *,
     tell: Say | None = None,
@@ -137,6 +143,8 @@ def run(
         A problem, or what makes one; see `problem_of`.
     out
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
+    comm
+        The processes; by default those of the mesh that a program gave, or all.
     say
         Called on rank 0 with one line of text per accepted point.
     tell
@@ -162,6 +170,7 @@ def run(
     DiskError
         If the disk is full before the first point.
     """
+    comm = processes(case, comm)
     problem = problem_of(case, comm, terms)
     return run_problem(
         problem,

@@ -74,6 +74,8 @@ class Shell:
                 raise CaseError(f"{NAME}: shell.{strange}: is of a mesh; a {surface} has its own edges")
             self._keys |= {"geometry": surface}
             return
+        if strange := next((key for key in ("geometry", "file") if key in keys), None):
+            raise CaseError(f"{NAME}: shell.{strange}: the surface is the mesh; leave it out")
         self.home = Home(surface)
         triangles = self.home.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
         self.files.given[Path(MESH).absolute()] = triangles
@@ -195,7 +197,7 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
             "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
         }
         others: Keys = shell.plain(keys, "magnetic")
-        return both | others | ({"lambda_m": float(lambda_m)} if lambda_m is not None else {})
+        return both | others | ({"lambda_m": shell.plain(lambda_m, "magnetic.lambda_m")} if dimensionless else {})
 
     return Piece("magnetic", made)
 
@@ -216,11 +218,15 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
         size = 1.0 if dimensionless else float(np.linalg.norm(given.largest)) or 1.0
         return {**kind, "components": given.mapped(lambda B: np.asarray(B / size)), **of_size(size)}
     components = shell.plain(value, key)
-    if len(components) != 3:
-        raise CaseError(f"{NAME}: {key}: has {len(components)} components; a vector has three")
-    if any(isinstance(each, str) for each in components):
-        return {**kind, "components": components, **of_size(1.0)}
-    x, y, z = map(float, components)
+    if not isinstance(components, list) or len(components) != 3:
+        raise CaseError(f"{NAME}: {key}: {components}: a vector has three components")
+    directed = any(components) or not dimensionless  # zero has a size, and no direction
+    if not directed or any(isinstance(each, str) for each in components):
+        return {**kind, "components": list(map(str, components)), **of_size(1.0)}
+    try:
+        x, y, z = map(float, components)
+    except (TypeError, ValueError):
+        raise CaseError(f"{NAME}: {key}: {components}: its components are numbers or formulas") from None
     direction = {"polar": degrees(atan2(hypot(x, y), z)), "azimuth": degrees(atan2(y, x))}
     return {**direction, **of_size(hypot(x, y, z))}
 
@@ -254,6 +260,8 @@ def Problem(
     CaseError, MeshError
         One message with every mistake; on every rank.
     """
+    if not isinstance(shell, Shell):
+        raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
     data: Keys = {"shell": shell.section(), "boundary": {}, **shell.plain(sections, "case")}
     steps, terms = list[Keys](), list[OwnTerm]()
     for part in parts:
@@ -264,16 +272,34 @@ def Problem(
         elif part.key == "loading":
             steps.append(part.keys(shell))
         else:
-            data[part.key] = {**data.get(part.key, {}), **part.keys(shell)}
+            _join(data, part.key, part.keys(shell))
+    if steps and "loading" in data:
+        raise CaseError(f"{NAME}: loading: is given twice, as steps and as a section")
     if steps:
         data["loading"] = steps[0] if len(steps) == 1 else steps
-    if points:
-        data["points"] = shell.plain(points, "points")
+    _join(data, "points", shell.plain(points or {}, "points"))
     if degree is not None:
-        data["mesh"] = {**data.get("mesh", {}), "degree": degree}
+        _join(data, "mesh", {"degree": degree})
     if symmetry or shell.home:
         data["symmetry"] = symmetry or "none"
     return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
+
+
+def _join(data: Keys, key: str, more: Keys) -> None:
+    """Add what a section has, in which nothing may be given twice.
+
+    Raises
+    ------
+    CaseError
+        If something is, with another value.
+    """
+    known = data.get(key, {})
+    if not isinstance(known, dict):
+        raise CaseError(f"{NAME}: {key}: {known!r}: must be a section, with keys below it")
+    for name, value in more.items():
+        if name in known and known[name] != value:
+            raise CaseError(f"{NAME}: {key}.{name}: is given twice, as {known[name]} and as {value}")
+    data[key] = {**known, **more}
 
 
 def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:

@@ -137,7 +137,7 @@ class Home:
     def _original(self, cells: Any) -> Numbers:
         """The number of each local cell, ghosts included, in the order in which all were made."""
         local = cells.size_local + cells.num_ghosts
-        made = np.asarray(self.mesh.topology.original_cell_index[:local], dtype=np.int64)
+        made = compat.original_cells(self.mesh)[:local]
         every = np.concatenate(self.comm.allgather(made[: self._owned]))
         if len(every) == cells.size_global and (np.sort(every) == np.arange(cells.size_global)).all():
             return made
@@ -162,17 +162,43 @@ class Home:
         return np.asarray(x[:, order]), np.asarray(ids[:, order])
 
     def _chosen(self, key: str, part: Part, tags: mesh.MeshTags | None, dimension: int) -> NDArray[np.int32]:
-        """Local facets or cells."""
-        if not isinstance(part, int | np.integer):
-            return np.asarray(part, dtype=np.int32)
-        what = "facet_tags" if dimension == 1 else "cell_tags"
-        if tags is None or tags.dim != dimension:
-            raise MeshError(f"{key}: {part}: is a value of tags: give {what}")
-        found = tags.find(part)
-        if not self.comm.allreduce(len(found)):
-            there = sorted({int(value) for values in self.comm.allgather(np.unique(tags.values)) for value in values})
+        """Local facets or cells.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if there are none on any, or what one rank has is of no part of this mesh.
+        """
+        what, named = ("facet_tags", "facets") if dimension == 1 else ("cell_tags", "cells")
+        found, said = np.empty(0, dtype=np.int32), ""
+        by_value = isinstance(part, int | np.integer)
+        if not by_value:
+            said = self._strange(np.asarray(part), dimension, named)
+            found = found if said else np.asarray(part, dtype=np.int32)
+        elif tags is None or tags.dim != dimension:
+            said = f"is a value of tags: give {what}"
+        elif not compat.tags_of(tags, self.mesh):
+            said = f"{what} belong to another mesh than that of the shell"
+        else:
+            found = np.asarray(tags.find(part))
+        if wrong := next(filter(None, self.comm.allgather(said)), ""):
+            raise MeshError(f"{key}: {part}: {wrong}" if by_value else f"{key}: {wrong}")
+        values = [] if tags is None else np.unique(tags.values)
+        there = sorted({int(value) for each in self.comm.allgather(values) for value in each})
+        if not self.comm.allreduce(len(found)) and by_value:
             raise MeshError(f"{key}: {part}: {what} have no such value, only {', '.join(map(str, there)) or 'none'}")
-        return np.asarray(found)
+        return found
+
+    def _strange(self, numbers: NDArray[Any], dimension: int, named: str) -> str:
+        """What is wrong with local numbers of facets or cells on this rank; empty if nothing is."""
+        self.mesh.topology.create_entities(dimension)
+        there = self.mesh.topology.index_map(dimension)
+        count = there.size_local + there.num_ghosts
+        if numbers.ndim != 1 or (len(numbers) and numbers.dtype.kind not in "iu"):
+            hint = ": np.flatnonzero(...) of a mask" if numbers.dtype.kind == "b" else ""
+            return f"is neither a value of tags nor a list of local numbers of {named}{hint}"
+        outside = numbers[(numbers < 0) | (numbers >= count)]
+        return f"{outside[0]}: this process has {named} 0 to {count - 1}" if len(outside) else ""
 
     def _ends(self, facets: NDArray[np.int32]) -> Pairs:
         """Global numbers (e, 2) of the vertices of facets of all ranks."""

@@ -35,10 +35,11 @@ TURNED = {
     10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9],
 }  # nodes of a reversed triangle, gmsh's order
 SAME_PLACE = 1e-9  # of the extent
+TIE = 1e-6  # of the area: a difference that decides nothing
 
 
 def oriented(nodes: Array, cells: Cells) -> Cells:
-    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area.
+    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area, or of a rule where there is none.
 
     Raises
     ------
@@ -75,9 +76,27 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
     elsewhere = np.flatnonzero(~as_first & (copy[m:] != copy[0]))
     if len(elsewhere):
         raise MeshError(_torn(nodes, cells, int(elsewhere[0])))
-    if areas[~as_first].sum() > areas[as_first].sum():
+    if _other_side(nodes, cells, areas, as_first):
         as_first = ~as_first
     return np.where(as_first[:, None], cells, cells[:, TURNED[cells.shape[1]]])
+
+
+def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
+    """Whether the normals are those of the triangles that are not `as_first`: of the larger area.
+
+    Halves of the same size, as refined meshes have them, do not depend on the numbers of triangles: their normals point
+    upwards on the whole, else along e2 or e1, else out of the volume.
+    """
+    same, whole = areas[as_first].sum(), areas.sum()
+    if abs(2 * same - whole) > TIE * whole:
+        return bool(2 * same < whole)
+    a, b, c = (nodes[cells[:, i]] - nodes.mean(axis=0) for i in range(3))
+    vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
+    outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
+    for along in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
+        if abs(total := along.sum()) > TIE * whole:
+            return bool(total < 0)
+    return False
 
 
 def _torn(nodes: Array, cells: Cells, apart: int) -> str:

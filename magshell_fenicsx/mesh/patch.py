@@ -51,7 +51,7 @@ class Triangles:
         return _digest(self.nodes, self.cells, *named)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GivenField:
     """Numbers that vary over `Triangles` as a program gives them, polynomials in each; nobody changes it.
 
@@ -73,7 +73,10 @@ class GivenField:
     degree: int
     nodal: Array
     swapped: NDArray[np.int64]
-    home: "Home | None" = field(default=None, repr=False)
+    home: "Home | None" = None
+
+    def __repr__(self) -> str:
+        return "a function on the mesh"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self

@@ -37,6 +37,21 @@ def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 
+def original_cells(domain: mesh.Mesh) -> NDArray[np.int64]:
+    """The number of each local cell in the order in which they were made; none of a part of another mesh."""
+    try:
+        return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+    except RuntimeError:  # in dolfinx 0.9
+        return np.empty(0, dtype=np.int64)
+
+
+def tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
+    """Whether tags belong to a mesh; topologies have a wrapper, or not."""
+    topologies = (tags.topology, domain.topology)
+    own, other = (getattr(each, "_cpp_object", each) for each in topologies)
+    return own is other
+
+
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:
     """Add a bilinear form to a matrix, skipping the rows and columns of `clamped`."""
     cpp = form._cpp_object

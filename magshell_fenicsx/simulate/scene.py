@@ -213,6 +213,11 @@ class Scene:
             return found
         if self.problem.half:
             raise ValueError("u: symmetry: half: half of the mesh is not modelled: take symmetry: none")
+        if MPI.Comm.Compare(self.comm, known.home.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+            raise ValueError(
+                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {known.home.comm.size}: "
+                "make the scene with those of the mesh, ms.Scene(problem)"
+            )
         return known.home.displacement(found, surface.given, known.scale)
 
     def refuse_foreign(self, state: State, *, more: bool = False) -> None:

@@ -106,6 +106,14 @@ def test_thickness_as_a_function(dome: Dome) -> None:
     close(path(dome, thickness_factor=function(dome, ("DG", 0), lambda x: 1 + 0 * x[0])), path(dome))
 
 
+def test_a_thickness_that_is_negative_between_the_nodes_of_the_displacement(dome: Dome) -> None:
+    """Quadratic in each triangle, one at its vertices and less than zero at the middle of a side."""
+    thin = function(dome, ("DG", 2), lambda x: 1 + 0 * x[0])
+    thin.x.array[3::6] = -0.02
+    with pytest.raises(MeshError, match=r"shell\.thickness_factor: is not within 0\.001 to 1000 at"):
+        ms.Scene(ms.Problem(shell(dome, thickness_factor=thin), ms.Clamped("rim"), degree=3), MPI.COMM_SELF)
+
+
 def test_remanence_as_a_function(dome: Dome) -> None:
     remanent = function(dome, ("DG", 2, (3,)), lambda x: 0.06 * np.stack([x[1] / R, 0 * x[0], 1 + x[0] / R]))
     formulas = ["0.06*y", "0", "0.06*(1 + x)"]
@@ -208,6 +216,68 @@ def test_what_does_not_fit_is_refused(dome: Dome) -> None:
     term = ms.OwnTerm("bed", lambda r0, u, k: k * ufl.dot(u.r, u.r), (elsewhere,))
     with pytest.raises(MeshError, match=r"terms: bed: a function on a mesh: that is of a problem"):
         ms.Scene(CASES / "dimple_buckling.yaml", terms=[term])
+
+
+def cap(*parts: Any, **sections: Any) -> Any:
+    """A problem without a mesh, of which only the words count."""
+    shell = ms.Shell("cap", polar=40, radius=1.0, thickness=0.02, poisson_ratio=0.3)
+    return ms.Problem(shell, ms.Clamped("rim"), *parts, **sections)
+
+
+def test_what_is_given_twice_is_refused() -> None:
+    """The later of two values would win without a word."""
+    field = ms.Field([0, 0, 1], [1, 0, 0], lambda_m=1e-3)
+    twice = [
+        ((ms.Hinged("rim"),), {}, "boundary.rim: is given twice, as clamped and as hinged"),
+        ((field, ms.Field([0, 0, 1], [1, 0, 0], lambda_m=2e-3)), {}, "magnetic.lambda_m: is given twice, as 0.001 and"),
+        ((ms.Section("shell", poisson_ratio=0.4),), {}, "shell.poisson_ratio: is given twice, as 0.3 and as 0.4"),
+        ((ms.Pressure(),), {"loading": {"kind": "pressure"}}, "loading: is given twice, as steps and as a section"),
+        ((), {"degree": 3, "mesh": {"degree": 4}}, "mesh.degree: is given twice, as 4 and as 3"),
+        ((), {"degree": 3, "mesh": 1}, "mesh: 1: must be a section, with keys below it"),
+    ]
+    for parts, sections, said in twice:
+        with pytest.raises(ms.CaseError, match=rf"^Problem: {re.escape(said)}"):
+            cap(*parts, **sections)
+    assert cap(field, field, ms.Clamped("rim")).lambda_m == 1e-3
+
+
+def test_a_vector_that_is_zero_has_no_direction() -> None:
+    """With `lambda_m` vectors are over their magnitudes: zero is no field, and not one along e3."""
+
+    def pulled(remanent: Any, applied: Any) -> float:
+        *_, record = ms.follow(cap(ms.Field(remanent, applied, lambda_m=1e-3), ms.Step("field", points=1)))
+        return float(np.abs(record.point.state.u).max())
+
+    assert pulled([0, 0, 1], [0, 0, 1]) > 1e-4
+    assert pulled([0, 0, 0], [0, 0, 1]) < 1e-15
+    assert pulled([0, 0, 1], np.zeros(3)) < 1e-15
+
+
+def test_what_is_no_vector_and_no_shell(dome: Dome) -> None:
+    for vector in (1.0, None, [0, 1], np.eye(3)):
+        with pytest.raises(ms.CaseError, match=r"^Problem: magnetic\.remanent: .*: a vector has three|numbers or form"):
+            cap(ms.Field(vector, [0, 0, 1], lambda_m=1e-3))
+    with pytest.raises(ms.CaseError, match=r"magnetic\.lambda_m: 'abc': must be a valid number"):
+        cap(ms.Field([0, 0, 1], [0, 0, 1], lambda_m="abc"))  # type: ignore[arg-type]
+    with pytest.raises(ms.CaseError, match=r"the first argument is what ms\.Shell gives"):
+        ms.Problem(dome[0], ms.Clamped("rim"))  # type: ignore[arg-type]
+    with pytest.raises(ms.CaseError, match=r"shell\.geometry: the surface is the mesh; leave it out"):
+        shell(dome, geometry="disc")
+    one = function(dome, ("Lagrange", 1), lambda x: 1 + 0 * x[0])
+    with pytest.raises(ms.CaseError, match=r"^Problem: foundation\.factor: a function on the mesh: must be"):
+        ms.Problem(shell(dome), ms.Clamped("rim"), ms.Section("foundation", stiffness=1.0, factor=one))
+
+
+def test_terms_whose_value_is_none() -> None:
+    def bed(r0: Any, u: Any) -> Any:
+        return ufl.dot(u.r, u.r) / 2
+
+    for value in (np.nan, np.inf, "1e-4", None):
+        with pytest.raises(ValueError, match=r"bed: value: .*: must be a finite number"):
+            ms.OwnTerm("bed", bed, value=value)
+    with pytest.raises(ValueError, match=r"bed: on: \['a', 'b'\]: must be the name of one edge"):
+        ms.OwnTerm("bed", bed, on=["a", "b"])  # type: ignore[arg-type]
+    assert ms.OwnTerm("bed", bed, value=np.float64(2)).value == 2
 
 
 def folds(folder: Path, ranks: int) -> tuple[float, float]:

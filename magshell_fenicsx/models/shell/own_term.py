@@ -4,7 +4,8 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import prod
+from math import isfinite, prod
+from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import basix.ufl
@@ -96,6 +97,10 @@ class OwnTerm:
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"{self.name!r}: a term's name is an identifier, such as foundation")
+        if not isinstance(self.value, Real) or not isfinite(self.value):
+            raise ValueError(f"{self.name}: value: {self.value!r}: must be a finite number")
+        if not isinstance(self.on, str | None):
+            raise ValueError(f"{self.name}: on: {self.on!r}: must be the name of one edge")
         if self._symbolic.W.ufl_shape:
             raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}")
         if strangers := self._strangers():

@@ -115,6 +115,13 @@ class Carried:
         table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[0, :, :, 0]
         return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
 
+    def between(self) -> tuple[Array, Array]:
+        """Values (cells, n, size) and places (cells, n, 3) in own cells at its nodes, and between them."""
+        X = basix.create_lattice(self.of.cell_type, 2 * max(self.of.degree, 1), basix.LatticeType.equispaced, True)
+        at, drawn = (element.tabulate(0, X)[0, :, :, 0] for element in (self.of, self.cells.element))
+        owned = slice(self.cells.owned)
+        return np.matmul(at, self.values[owned]), np.matmul(drawn, self.cells.nodal[owned])
+
     def _reference(self, places: Array) -> Array:
         """The reference points (n, 2) of places (n, 3) of the first cell, by Newton's method."""
         element, nodal = self.cells.element, self.cells.nodal[0]

@@ -87,6 +87,9 @@ def thickness_field(
     nodes, _ = places(r0)
     values = thickness.at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
+    if thickness.carried:
+        between, there = thickness.carried.between()
+        refuse_unfit(between[..., 0], there, V.mesh.comm)
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
         values[patch_of(patches or {}, name, "shell.thickness_factor")] = factor
