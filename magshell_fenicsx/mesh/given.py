@@ -170,7 +170,8 @@ class Home:
             On every rank, if there are none on any, or what one rank has is of no part of this mesh.
         """
         what, named = ("facet_tags", "facets") if dimension == 1 else ("cell_tags", "cells")
-        found, said = np.empty(0, dtype=np.int32), ""
+        found: NDArray[np.int32] = np.empty(0, dtype=np.int32)
+        said = ""
         by_value = isinstance(part, int | np.integer)
         if not by_value:
             said = self._strange(np.asarray(part), dimension, named)

@@ -294,10 +294,6 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
         _from_here(value, old, new)
 
 
-def _draw_reached(drawn: Callable[..., None], folder: Path, target: Callable[[Array], Array]) -> None:
-    drawn(reached_shape(folder, target))
-
-
 def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, Any]:
     """The results of best.yaml by `run` into verified/, and what its excluded modes say; collective."""
     wanted, say, file, settings = made.wanted, made.say, made.folder / "best.yaml", list[str]()
