@@ -106,9 +106,7 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the run in that folder even if it is another's, or unfinished")
     ] = False,
-    time_limit: Annotated[
-        float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
-    ] = None,
+    time_limit: Annotated[float | None, typer.Option(min=0, metavar="SECONDS", help="stop then; resumable")] = None,
     pictures: Annotated[bool, typer.Option(" /--no-pictures", show_default=False, help="plot draws them later")] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
