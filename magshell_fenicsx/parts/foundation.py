@@ -4,7 +4,8 @@ from collections.abc import Iterable
 from typing import Annotated, Self
 
 import ufl
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
+from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Formula
@@ -60,6 +61,18 @@ class Foundation(Part):
         if self.stiffness is None and self.tangential is None:
             raise ValueError("give stiffness, tangential, or both")
         return self
+
+    @field_validator("factor")
+    @classmethod
+    def _is_something(cls, text: str | None) -> str | None:
+        anywhere = [ufl.variable(ufl.as_ufl(number)) for number in (0.5, 0.25, 0.125)]
+        try:
+            found = symbolic(text, SYMBOLIC, *anywhere) if text else 1.0
+        except (ArithmeticError, ValueError):  # of numbers alone: no finite value, which the planner says with a place
+            return text
+        if isinstance(ufl.as_ufl(found), Zero):
+            raise ValueError(f"{text!r}: is zero everywhere: leave the foundation out")
+        return text
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         return [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)] if self.factor else []

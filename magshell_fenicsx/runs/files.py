@@ -51,6 +51,9 @@ class AlreadyComplete(Exception):
         super().__init__(summary)
         self.summary = summary
 
+    def __str__(self) -> str:
+        return "the run is complete: there is nothing to resume"
+
 
 def open_folder(out: Path, document: Document, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
     """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is changed.

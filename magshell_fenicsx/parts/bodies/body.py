@@ -84,9 +84,10 @@ class Placed:
         CaseError
             If there is none.
         """
-        v = self.Q @ np.array(axis, dtype=float)
+        given = _not_short(axis)
+        v = self.Q @ given
         v = v - (v @ self.direction) * self.direction
-        if (size := float(np.linalg.norm(v))) < ALONG * np.linalg.norm(axis):
+        if (size := float(np.linalg.norm(v))) < ALONG * np.linalg.norm(given):
             raise CaseError(f"{self.key}.axis: is along the approach; give an axis across it")
         return np.asarray(v / size)
 
@@ -167,13 +168,18 @@ def place_body(section: BodySection, key: str, place: Array, normal: Array, half
         Half the thickness over R.
     """
     out = normal if section.side == "outside" else -normal
-    d = -out if section.direction is None else np.array(section.direction, dtype=float)
+    d = -out if section.direction is None else _not_short(section.direction)
     d = d / np.linalg.norm(d)
     d, ahead = Q @ d, section.ahead / R
     front = Q @ (place + half * out)
     if section.position is not None:
         front = Q @ (np.array(section.position) / R) + ahead * d
     return Placed(key, front, front - ahead * d, d, Q, R)
+
+
+def _not_short(v: Sequence[float]) -> Array:
+    """Along a vector that is not zero: the square of 1e-200 would be."""
+    return np.array(v, dtype=float) / max(map(abs, v))
 
 
 def refuse_unfit_bodies(bodies: Mapping[str, BodySection], *, solid: bool) -> None:

@@ -103,6 +103,10 @@ def test_place_and_symmetry() -> None:
     assert make_problem(case()).half
     assert make_problem(case(axis=[1, 2, 0])).half
     assert make_problem(case(semi_axes=[0.3, 0.3, 0.2])).axisymmetric
+    short, unit = (
+        make_problem(case(axis=[size, 2 * size, 0], direction=[0, 0, -size])).loads.contacts[0] for size in (1e-300, 1)
+    )
+    assert np.array_equal(short.distance.axes, unit.distance.axes)  # type: ignore[attr-defined]
 
 
 def test_mistakes() -> None:
