@@ -28,8 +28,8 @@ def _of_angles(value: Any) -> Any:
 class SpinStep(PathStep):
     """The shell spins about e3 through the origin: the forces ρ ω² r away from the axis, where it has moved to.
 
-    Points are equal parts of ω². Forces of Coriolis are left out: the shell rests beside its axis, and frequencies of
-    such a shell are those without them.
+    Points are equal parts of ω²; a `history` in time is of ω itself, over √(E/ρ)/R. Forces of Coriolis are left out:
+    the shell rests beside its axis, and frequencies of such a shell are those without them.
     """
 
     amplitude: ClassVar[str] = "spin"
@@ -53,6 +53,12 @@ class SpinStep(PathStep):
 
     def scale(self, now: Now) -> float:
         return (self.speed or now.h) ** 2
+
+    def of_history(self, value: float) -> float:
+        return value**2
+
+    def in_history(self, amplitude: float) -> float:
+        return sqrt(max(amplitude, 0.0))
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
         return [OwnTerm(step.name, energy, of_volume=True)]

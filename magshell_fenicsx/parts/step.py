@@ -137,6 +137,14 @@ class Step(Section):
         """What a target of one is of the amplitude."""
         return 1.0
 
+    def of_history(self, value: float) -> float:
+        """The amplitude at a value of a history, which is as the target is."""
+        return value
+
+    def in_history(self, amplitude: float) -> float:
+        """The value of a history at an amplitude."""
+        return amplitude
+
     def course(self, here: Here) -> Course:
         """How it goes on."""
         raise NotImplementedError

@@ -89,8 +89,8 @@ def level_of(problem: Problem, name: str, value: Level) -> float:
     return problem.lambda_m * (float(in_units("tesla")(value)) / (applied or 1.0) if isinstance(value, str) else value)
 
 
-def _scaled(of: Curve, size: float, unit: float) -> Curve:
-    return lambda t, before: size * of(t * unit, before)
+def _scaled(of: Curve, size: float, unit: float, amplitude: Callable[[float], float]) -> Curve:
+    return lambda t, before: amplitude(size * of(t * unit, before))
 
 
 class LoadsInTime:
@@ -110,17 +110,19 @@ class LoadsInTime:
     def __init__(self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]) -> None:
         self._mu, time = dict(state.mu), partial(time_of, problem)
         histories = dict(zip(load.drives, load.history.values(), strict=True))
-        unit = problem.time_unit or 1.0
+        unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
             # histories are in the case's own unit of time
-            of = curve(history, own_time, partial(level_of, problem, name), state.mu[name])
+            driven = steps.get(name)
+            here = driven.in_history(state.mu[name]) if driven else state.mu[name]
+            of = curve(history, own_time, partial(level_of, problem, name), here)
             size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
-            self._curves[name] = _scaled(of, size, unit)
+            self._curves[name] = _scaled(of, size, unit, driven.of_history if driven else float)
             self.marks |= set(marks(history, time, time(load.duration)))
-            first, here = self._curves[name](0.0, False), state.mu[name]
-            if name in motions and abs(first - here) > SAME * max(1.0, abs(here)):
-                raise CaseError(f"history.{name}: begins at {first:.6g}, but the support is at {here:.6g}")
+            first, given = self._curves[name](0.0, False), state.mu[name]
+            if name in motions and abs(first - given) > SAME * max(1.0, abs(given)):
+                raise CaseError(f"history.{name}: begins at {first:.6g}, but the support is at {given:.6g}")
 
         times = [time(load.duration), *(time(t) for history in histories.values() for t in times_of(history))]
         self._close = CLOSE * min(t for t in times if t)

@@ -142,3 +142,22 @@ def test_held_in_a_step() -> None:
     assert state.mu["spin"] == pytest.approx(SMALL)
     alone = made(**shell, boundary={"rim": "clamped"}, loading=pressure)
     assert abs(scene.observe(state)["w_pole_over_h"]) < abs(ended(alone)["w_pole_over_h"])
+
+
+def test_a_history_is_of_the_speed() -> None:
+    """As the target is: half of the time of a ramp from 0.02 to 0.04 is 0.03, and the amplitude its square."""
+    spin = {"kind": "spin", "speed": 0.02, "points": 1}
+
+    def spun(history: Any) -> list[float]:
+        time = {"kind": "time", "duration": 10.0, "points": 2, "history": {"spin": history}}
+        scene = ms.Scene(made(shell=CAP, boundary={"rim": "clamped"}, loading=[spin, time]))
+        return [scene.observe(record.point.state)["spin"] for record in ms.follow(scene)][-2:]
+
+    assert spun({"kind": "ramp", "to": 0.04, "over": 10.0}) == pytest.approx([0.03**2, 0.04**2])
+    assert spun("0.02 + 0.001*t") == pytest.approx([0.025**2, 0.03**2])
+
+
+def test_a_history_with_a_unit() -> None:
+    time = {"kind": "time", "duration": 1.0, "history": {"spin": {"kind": "step", "to": "200 rpm"}}}
+    with pytest.raises(CaseError, match=r"200 rpm: only the field's history has a unit, of a flux density such as"):
+        made(shell=CAP, boundary={"rim": "clamped"}, loading=[{"kind": "spin", "speed": 0.02}, time])

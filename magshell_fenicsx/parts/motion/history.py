@@ -25,8 +25,19 @@ def measured(unit: str) -> Any:
     return Annotated[float | with_unit(unit), AfterValidator(check)]
 
 
+def _level(value: float | str) -> float | str:
+    try:
+        in_units("tesla")(value)
+    except ValueError:
+        raise ValueError(
+            f"{value}: only the field's history has a unit, of a flux density such as 60 mT; of another load give a "
+            "number as its target is without a unit"
+        ) from None
+    return value
+
+
 Time: TypeAlias = measured("second")  # type: ignore[valid-type]
-Level: TypeAlias = measured("tesla")  # type: ignore[valid-type]
+Level: TypeAlias = Annotated[float | with_unit("tesla"), AfterValidator(_level)]  # type: ignore[valid-type]
 
 
 class RampHistory(Section):
@@ -34,7 +45,8 @@ class RampHistory(Section):
 
     kind: Literal["ramp"]
     to: Level
-    """Value at its end: of the field a flux density or a part of that in `magnetic`, otherwise as the load's target"""
+    """Value at its end: of the field a flux density or a part of that in `magnetic`, otherwise as the load's target, of
+    a spin the speed"""
     over: Time
     """Time that it takes"""
 
