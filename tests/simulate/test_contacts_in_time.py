@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.contacts_in_time import CASES, SMALL, apart, imbalance, moved
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import Source
@@ -92,3 +93,13 @@ def test_a_driven_ball_does_the_work() -> None:
     _, found = found_of(HELD, {"kind": "contact", "approach": 0.5, "points": 1}, moving)
     assert found[-1]["force"] == 0
     assert abs(found[-1]["imbalance"]) < 1e-5 * abs(found[-1]["work"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_ten_contacts_are_in_balance_and_two_runs_stay_together(name: str) -> None:
+    """Impact, release, rest, a held gas: within the default `balance`, and beside a Poisson's ratio that is changed."""
+    once, again = (moved(*CASES[name], change) for change in (0.0, SMALL))
+    assert len(CASES) == 10
+    assert imbalance(once) < 0.01
+    assert apart(once, again) < 1e-8
