@@ -8,11 +8,11 @@ from pydantic import Field, field_validator, model_validator
 from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.expressions import Formula, symbolic
 from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import OwnTerm, times_formula
+from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm, times_formula
 from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 

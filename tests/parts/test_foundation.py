@@ -165,7 +165,11 @@ def test_check_and_labels() -> None:
         ({"stiffness": -1}, DISC, "foundation.stiffness: -1"),
         ({"stifness": 1}, DISC, "did you mean stiffness"),
         ({}, DISC, "foundation: give stiffness, tangential, or both"),
-        ({"stiffness": 1, "factor": "0"}, DISC, r"foundation\.factor: '0': is zero everywhere: leave the foundation out"),
+        (
+            {"stiffness": 1, "factor": "0"},
+            DISC,
+            r"foundation\.factor: '0': is zero everywhere: leave the foundation out",
+        ),
         ({"tangential": 1, "factor": "0*x"}, DISC, r"foundation\.factor: '0\*x': is zero everywhere"),
         ({"stiffness": "1 N/m^3"}, DISC, "foundation.stiffness: has a unit"),
         ({"stiffness": "1 N/m"}, {**DISC, "radius": "1 m"}, "not convertible"),
