@@ -16,7 +16,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.messages import meaning
 from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES
+from magshell_fenicsx.quantities.registry import AMPLITUDES, IN_TIME, OF_EVERY_RUN, QUANTITIES
 
 _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text
 Schema = dict[str, Any]
@@ -213,12 +213,13 @@ def anchor(title: str) -> str:
 
 
 def columns_page() -> str:
-    """Both tables in Markdown."""
+    """Both tables in Markdown; the order of the parts' columns does not depend on what is imported first."""
+    of_parts = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
     columns = [
         (f"`{q.name}`", f"{q.html} {q.note}".strip() if q.symbol else q.words, q.unit, q.si, _in_units(q), q.meaning)
-        for q in QUANTITIES.values()
+        for q in (*OF_EVERY_RUN, *IN_TIME, *sorted(of_parts, key=lambda q: q.name))
     ]
-    amplitudes = [(f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for a in AMPLITUDES.values()]
+    amplitudes = [(f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for _, a in sorted(AMPLITUDES.items())]
     return "\n".join(
         [
             COLUMNS_HEAD,

@@ -57,7 +57,7 @@ def what_rank_0_gets() -> None:
 def any_error() -> None:
     for error in (ValueError("a bug"), KeyError("a bug"), AlreadyComplete({"a bug": 1}), MeshError("a bug")):
         for share in (from_first, by_first):
-            with raised(type(error), "a bug"):
+            with raised(type(error), str(error)):
                 share(COMM, failing(error))
     with raised(ValueError, "a bug"):
         prepare_folder(Path("nowhere"), COMM, failing(ValueError("a bug")))

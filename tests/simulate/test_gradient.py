@@ -197,7 +197,7 @@ def test_force_at_a_depth(tmp_path: Path) -> None:
     [
         ("sideways", "remanence", "sideways: has no gradient here; allowed are energy, tip_ux"),
         ("lambda_m", "remanence", "lambda_m: is a load here"),
-        ("tip_ux", "shell.width", "shell.width: a number of the mesh, of the shape or of a target"),
+        ("tip_ux", "shell.width", "shell.width: a number of the mesh, of the shape, of a target or of the output"),
         ("tip_ux", "magnetic.remanence", "magnetic.remanence: is no number"),
         ("tip_ux", "magnetic.lambda", r"magnetic.lambda: the case has no such key \(lambda\)"),
     ],
