@@ -45,8 +45,8 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
     "magnetism.source_step.SourcesSeen",
-    "magnetism.softness.SoftSeen",
-    "magnetism.own_field.SensorsSeen",
+    "magnetism.readings.SoftSeen",
+    "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`

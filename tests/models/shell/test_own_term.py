@@ -295,6 +295,6 @@ def test_parameters_need_no_new_kernel() -> None:
     ]
     served = [next(t for t in m.system.terms if t.name == "own").points for m in models]  # type: ignore[attr-defined]
     kernels = [next(site for site in each._sites if "own" in site.names)._points.gradient for each in served]
-    assert kernels[0].ufcx_expression == kernels[1].ufcx_expression
+    assert len({kernel.key for kernel in kernels}) == 1
     u = random_displacement(models[0], 1e-2)
     assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))
