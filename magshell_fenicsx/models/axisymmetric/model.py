@@ -5,8 +5,8 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from magshell_fenicsx.models.axisymmetric.waves import ExcludedWaves, Waves
 from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
-from magshell_fenicsx.models.shell.patterns import cells_of
+from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
@@ -128,11 +128,13 @@ class MeridianModel(Thin):
         sigma: float | None = None,
         thickness: Thickness | None = None,
     ) -> None:
-        self.meridian, self.material, self.degree, self.loads = meridian, material, degree, loads
+        self.meridian, self.material, self.degree = meridian, material, degree
         self.conditions = conditions
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
+        of_place = partial(field_of_place, self.r0)
+        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
         self.sigma = default_penalty(degree) if sigma is None else sigma
         shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None

@@ -6,7 +6,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -37,7 +37,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import carried, cells_of
+from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
@@ -130,7 +130,10 @@ class ShellModel(Thin):
             if (field := getattr(loads, name)) and field.given:
                 vectors = carried(field.given, midsurface, in_cells)
                 loads = replace(loads, **{name: replace(field, remanent=vectors)})
-        loads = self.loads = replace(loads, own=tuple(term.with_functions(midsurface.function) for term in loads.own))
+        of_place = partial(field_of_place, self.r0)
+        loads = self.loads = replace(
+            loads, own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own)
+        )
         if thickness and thickness.given:
             thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
         self.sigma = default_penalty(degree) if sigma is None else sigma

@@ -27,11 +27,12 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
+from magshell_fenicsx.models.shell.own_term import ByPlace
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Magnetisation, Material, Potential
-from magshell_fenicsx.models.shell.patterns import ByPatch, cells_of_body, places_in_body
+from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.sites import make_sites
-from magshell_fenicsx.models.solid.terms import Density, TermFactory
+from magshell_fenicsx.models.solid.terms import Density, TermFactory, field_in_body
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
@@ -87,13 +88,18 @@ class SolidModel(Observed):
     ) -> None:
         if loads.magnetic:
             loads = replace(loads, magnetic=_in_cells(loads.magnetic, body))
-        self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
+        self.body, self.material, self.neo_hookean = body, material, neo_hookean
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = quadratic(body.mesh)
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
+
+        def of_place(parameter: ByPlace) -> fem.Function:
+            return field_in_body(Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1)
+
+        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
         free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
         if loads.natural:

@@ -212,10 +212,10 @@ class TermFactory:
 
     def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
         """A density of the volume, which depends on places alone."""
-        flat, count = [ufl.zero(3)] * len(CURVED), len(term.parameters)
+        flat, count, at_point = [ufl.zero(3)] * len(CURVED), len(term.parameters), term.at_point(of)
 
         def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
-            return of(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
+            return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
 
         constants = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(at, (*constants, *self._constants(self.h)), VALUE)
@@ -230,7 +230,7 @@ class TermFactory:
         flat = [ufl.zero(3)] * len(SECOND)
 
         def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
-            return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
+            return per_area(term.at_point(of))(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
