@@ -154,7 +154,7 @@ def _meaning(part: type[Part]) -> str:
 
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
     WithParts = WithOwnTerms
 else:  # an optional key for each part

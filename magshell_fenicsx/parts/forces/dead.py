@@ -27,7 +27,7 @@ from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.softness import parity
 from magshell_fenicsx.parts.seen import Sight
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.parts.seen import Seen, Sight, Slope
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class SensorsSeen(Seen):
 
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
-        from magshell_fenicsx.models.shell.parameters import ACROSS
+        from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
         from magshell_fenicsx.parts.magnetism.own_field import CENTRAL, STEP, own_field
 
         found = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import ByFormula, formula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Sight

@@ -20,19 +20,20 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.waves import ExcludedWaves, Waves
 from magshell_fenicsx.models.carriers import on_meridian
-from magshell_fenicsx.models.observed import Thin
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
-from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import openings, supports
 from magshell_fenicsx.parts.supports.supports import held_on
+from magshell_fenicsx.shells.observed import Thin
+from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
+from magshell_fenicsx.shells.waves import ExcludedWaves, Waves
 
 Array = NDArray[np.float64]
 
