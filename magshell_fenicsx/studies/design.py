@@ -341,7 +341,7 @@ def _value(result: Result, name: str) -> float | None:
         return None
     row = result.rows[-1]
     try:
-        omega2 = vibration_at_end(result.scene, result.history, name)
+        omega2 = vibration_at_end(result.scene, result.walked, name)
     except Lost:
         return None
     return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2
