@@ -90,6 +90,15 @@ def test_pictures_of_pyvista_without_a_display(tmp_path: Path, monkeypatch: pyte
     raise AssertionError(f"{socket} is still there")
 
 
+def test_a_case_of_a_mapping() -> None:
+    """Documented with `Case.load`; a mistake is one message with the key."""
+    disc = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
+    case = ms.Case.from_source({"shell": disc, "boundary": {"rim": "clamped"}, "loading": {"kind": "pressure"}})
+    assert case.problem().material.h == 1 / 50
+    with pytest.raises(ms.CaseError, match=r"shell\.poisson_ratio: 0\.7: must be less than or equal to 0\.5"):
+        ms.Case.from_source({"shell": {**disc, "poisson_ratio": 0.7}, "boundary": {"rim": "clamped"}})
+
+
 def test_no_display_and_no_virtual_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr(pyvista, "OFF_SCREEN", False)
