@@ -35,8 +35,8 @@ if TYPE_CHECKING:
         Shell,
         Step,
     )
-    from magshell_fenicsx.runs.notebook import curve, picture, polydata, surface
-    from magshell_fenicsx.runs.rows import columns
+    from magshell_fenicsx.runs.notebook import curve, off_screen, picture, polydata, surface
+    from magshell_fenicsx.runs.rows import Table, columns
     from magshell_fenicsx.runs.summary import Result
     from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
@@ -66,6 +66,7 @@ __all__ = [
     "Shell",
     "Step",
     "Stopped",
+    "Table",
     "__version__",
     "boundary",
     "columns",
@@ -74,6 +75,7 @@ __all__ = [
     "follow",
     "gradient",
     "kinematics",
+    "off_screen",
     "picture",
     "polydata",
     "run",
@@ -91,8 +93,8 @@ _ROOMS = {
     "models.shell.own_term": "Free OwnTerm",
     "public": "Scene boundary follow run",
     "python": "Clamped Field Force Held Hinged OnPlane Pressure Problem Section Shell Step",
-    "runs.notebook": "curve picture polydata surface",
-    "runs.rows": "columns",
+    "runs.notebook": "curve off_screen picture polydata surface",
+    "runs.rows": "Table columns",
     "runs.summary": "Result",
     "simulate.gradients.gradient": "gradient",
     "simulate.record": "Record Stopped",

@@ -2,16 +2,20 @@
 
 import csv
 import gc
+import inspect
 import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from typer.testing import CliRunner
 
 from magshell_fenicsx.cli import app
 
 NICE = ["nice", "-n", "-10"]
+# click before 8.2 mixes both streams by default
+APART: dict[str, Any] = {"mix_stderr": False} if "mix_stderr" in inspect.signature(CliRunner).parameters else {}
 FIRST = [] if subprocess.run([*NICE, "true"], capture_output=True, check=False).stderr else NICE  # root may
 
 
@@ -21,7 +25,7 @@ def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.Compl
     if ranks > 1:
         return started(*words, ranks=ranks, pictures=False)
     words += ["--no-pictures"] if words[:1] == ["run"] and ranks else []
-    done = CliRunner(mix_stderr=False).invoke(app, words, prog_name="magshell")
+    done = CliRunner(**APART).invoke(app, words, prog_name="magshell")
     gc.unfreeze()  # a run freezes what it leaves, as its process ends soon
     if done.exception and not isinstance(done.exception, SystemExit):
         raise done.exception

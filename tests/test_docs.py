@@ -37,7 +37,7 @@ def commands(page: Path) -> Iterator[list[str]]:
     """Words of every indented command line with magshell or make."""
     lines = re.sub(r"\\\n\s*", " ", text(page)).splitlines()
     for line in lines:
-        if re.match(r"    (\S*in-env .*magshell |make )", line):
+        if re.match(r"    (\S*in-env .*magshell |magshell |make )", line):
             yield shlex.split(line, comments=True)
 
 
@@ -81,21 +81,27 @@ def test_yaml_is_a_case_that_can_be_built(page: Path, block: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: str(page.relative_to(TOP)))
-def test_commands_are_understood(page: Path) -> None:
-    """Options are known to the command line, cases are there and take their settings."""
+def test_commands_are_understood(page: Path, tmp_path: Path) -> None:
+    """Options are known to the command line, none is missing, cases are there and take their settings."""
+    for number, block in enumerate(blocks(page, "yaml")):
+        (tmp_path / ("cap.yaml" if page.stem == "tutorial" else f"{number}.yaml")).write_text(block, encoding="utf-8")
     known = get_command(app).commands  # type: ignore[attr-defined]
     for words in commands(page):
         if words[0] == "make":
             assert re.search(rf"^[\w ]*\b{words[1]}\b.*:", text(TOP / "Makefile"), re.MULTILINE), words
             continue
         name, *rest = words[words.index("magshell") + 1 :]
-        if name == "--help":
+        if name.startswith("--"):  # of magshell itself
             continue
         options = {option for parameter in known[name].params for option in parameter.opts}
-        assert {word.partition("=")[0] for word in rest if word.startswith("--")} <= options, words
+        given = {word.partition("=")[0] for word in rest if word.startswith("--")}
+        assert given <= options, words
+        needed = [p.opts for p in known[name].params if p.required and p.opts[0].startswith("--")]
+        assert all(given & set(opts) for opts in needed), words
         settings = [after for word, after in pairwise(rest) if word == "--set"]
         for case in (word for word in rest if word.endswith(".yaml")):
-            assert Case.load(TOP / case, settings)
+            places = (place / case for place in (TOP, CASES, tmp_path) if (place / case).is_file())
+            assert Case.load(next(places), settings)
 
 
 def test_numbers_of_the_tutorial(tmp_path: Path) -> None:

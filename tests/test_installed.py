@@ -1,11 +1,15 @@
-"""The package does its work where only pip put it: another folder, without the repository on the path."""
+"""What is published, and that it does its work where only pip put it: another folder, without the repository."""
 
 import csv
+import email
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
+import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -47,33 +51,71 @@ class Installed:
         return done.stdout.strip()
 
 
+@dataclass(frozen=True)
+class Built:
+    """What is published."""
+
+    sdist: Path
+    wheel: Path
+
+
+BACKEND = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+
+
+def built(kind: str, source: Path, to: Path) -> Path:
+    """The sdist or the wheel of a folder, as a frontend has it made."""
+    done = outside([sys.executable, "-c", BACKEND, f"build_{kind}", to], source)
+    assert done.returncode == 0, done.stderr
+    return to / done.stdout.splitlines()[-1]
+
+
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """From a copy of the repository, for pip leaves its build in there; the copy is gone when it is used."""
-    place = tmp_path_factory.mktemp("installed")
-    copy, home = place / "copy", place / "venv"
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """The sdist of a copy of the repository, for setuptools leaves its build in there, and the wheel of the sdist."""
+    place = tmp_path_factory.mktemp("built")
     left_out = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*", "build", "results", "docs", "tests")
-    shutil.copytree(TOP, copy, ignore=left_out)
+    shutil.copytree(TOP, place / "copy", ignore=left_out)
+    sdist = built("sdist", place / "copy", place)
+    shutil.unpack_archive(sdist, place / "unpacked", filter="data")
+    (source,) = (place / "unpacked").iterdir()
+    wheel = built("wheel", source, place)
+    for folder in ("copy", "unpacked"):
+        shutil.rmtree(place / folder)
+    return Built(sdist, wheel)
+
+
+@pytest.fixture(scope="module")
+def installed(archives: Built, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """From the wheel, with dolfinx and the rest of the system's packages."""
+    place = tmp_path_factory.mktemp("installed")
+    home = place / "venv"
+    offline = ("--no-deps", "--no-index", "--disable-pip-version-check")
     commands: list[list[str | Path]] = [
         [sys.executable, "-m", "venv", "--without-pip", "--system-site-packages", home],
-        [
-            sys.executable,
-            "-m",
-            "pip",
-            "--python",
-            home,
-            "install",
-            "--no-deps",
-            "--no-index",
-            "--no-build-isolation",
-            copy,
-        ],
+        [sys.executable, "-m", "pip", "--python", home, "install", *offline, archives.wheel],
     ]
     for command in commands:
         done = outside(command, place)
         assert done.returncode == 0, done.stderr
-    shutil.rmtree(copy)
     return Installed(place)
+
+
+@pytest.mark.slow
+def test_what_is_published(archives: Built) -> None:
+    """A wheel for every machine with Python 3, its metadata complete, and the sources with their licence."""
+    assert archives.wheel.name == f"magshell_fenicsx-{__version__}-py3-none-any.whl"
+    with zipfile.ZipFile(archives.wheel) as wheel:
+        names = wheel.namelist()
+        (metadata,) = (name for name in names if name.endswith(".dist-info/METADATA"))
+        told = email.message_from_bytes(wheel.read(metadata))
+    assert told["Name"] == "magshell-fenicsx"
+    assert told["License-Expression"] == "MIT"
+    assert told.get_payload().startswith("# magshell_fenicsx\n")
+    assert all(told[key] for key in ("Summary", "Author", "Keywords", "Requires-Python", "Classifier", "Project-URL"))
+    assert {name.partition("/")[0].partition("-")[0] for name in names} == {"magshell_fenicsx"}, "no tests, no cases"
+    with tarfile.open(archives.sdist) as sdist:
+        sources = {name.partition("/")[2] for name in sdist.getnames()}
+    assert sources >= {"LICENSE", "README.md", "pyproject.toml", "setup.py", "meshes/gripper.msh"}
 
 
 @pytest.mark.slow

@@ -13,8 +13,6 @@
 # %%
 from pathlib import Path
 
-import pandas
-
 import magshell_fenicsx as ms
 
 CASES = Path(__file__).parents[1] if "__file__" in globals() else Path("..")
@@ -32,10 +30,10 @@ for record in ms.follow(scene):
     print(f"{record.label:6} p/p_c = {record.point.state.mu['pressure']:.6f}")
 
 # %% [markdown]
-# The columns of path.csv as a frame of pandas; `ms.columns` itself gives NumPy arrays.
+# The columns of path.csv as a frame of pandas; `ms.columns` itself is a mapping of NumPy arrays.
 
 # %%
-table = pandas.DataFrame(ms.columns(scene, records))
+table = ms.columns(scene, records).to_pandas()
 table[["label", "lambda_m", "p_over_pc", "w_pole_over_h", "volume_change"]]
 
 # %%

@@ -3,12 +3,17 @@
 import re
 
 project = "magshell_fenicsx"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
 html_theme = "furo"
 html_title = "magshell_fenicsx"
 html_show_copyright = False
-source_suffix = {".md": "markdown"}
+source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
 exclude_patterns = ["site"]
+nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}  # cases/notebooks, which docs/notebooks is
+nb_execution_mode = "force"
+nb_execution_timeout = 300  # s for a cell
+nb_execution_raise_on_error = True
+nb_merge_streams = True
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 4
 autodoc_member_order = "bysource"

@@ -63,19 +63,12 @@ class PointKernel:
     ----------
     size
         Number of its components.
-    key
-        What is compiled: equal keys are one library.
     """
 
     def __init__(
-        self,
-        function: COMPILED,
-        fields: Sequence[fem.Function],
-        constants: Sequence[fem.Constant],
-        size: int,
-        key: str,
+        self, function: COMPILED, fields: Sequence[fem.Function], constants: Sequence[fem.Constant], size: int
     ) -> None:
-        self._function, self.size, self.key = function, size, key
+        self._function, self.size = function, size
         self._constants, self._fields = [c.value for c in constants], [f.x.array for f in fields]  # views
         self._places = np.array([values.ctypes.data for values in self._fields], np.uintp)
         self._sizes = np.array([f.ufl_shape[0] for f in fields], np.int32)
@@ -114,7 +107,7 @@ def _kernel(
     ends = [[number[node] for node in each] for each in nodes]
     key = repr((_version(), asked, ends, operations))
     library = log.load(name, key, lambda: point_code.point_code(graph, made(graph, nodes)), OPTIONS, comm)
-    return PointKernel(function_of(library), fields, constants, size, key)
+    return PointKernel(function_of(library), fields, constants, size)
 
 
 @cache

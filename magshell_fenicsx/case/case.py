@@ -373,8 +373,16 @@ class Case(WithParts):
         return cls.from_source(read_source(Path(file), settings))
 
     @classmethod
-    def from_source(cls, source: Source) -> "Case":
-        """Validate plain data; see `load`."""
+    def from_source(cls, source: Source | Mapping[str, Any]) -> "Case":
+        """A case of a mapping like a case file, or of a `Source`, which knows its places in a file.
+
+        Raises
+        ------
+        CaseError
+            See `load`; of a mapping the message begins with the key.
+        """
+        if not isinstance(source, Source):
+            source = Source("case", dict(source))
         try:
             context = {"folder": source.folder, "files": source.files}
             case = cls.model_validate(source.data, context=context)

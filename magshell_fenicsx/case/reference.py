@@ -5,6 +5,7 @@ They are docs/case.schema.json and docs/case.md.
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -60,10 +61,11 @@ The column `amplitude` names the amplitude that varied:
 
 
 class _WithMeanings(GenerateJsonSchema):
-    """Gives keys their docstrings."""
+    """Gives keys their docstrings, and sections the full names of their classes as titles."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
         found = super().model_schema(schema)
+        found["title"] = f"{schema['cls'].__module__}.{schema['cls'].__qualname__}"
         for key, value in found.get("properties", {}).items():
             if words := meaning(schema["cls"], key):
                 value.setdefault("description", words)
@@ -76,7 +78,7 @@ class _WithMeanings(GenerateJsonSchema):
 def schema() -> dict[str, Any]:
     """What a case file may hold, key by key; rules between keys are `Case`'s alone."""
     head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "magshell_fenicsx case"}
-    whole = _without_noise(Case.model_json_schema(schema_generator=_WithMeanings))
+    whole = _without_noise(_apart(Case.model_json_schema(schema_generator=_WithMeanings)))
     whole["properties"] = dict(
         sorted(whole["properties"].items(), key=lambda item: item[0] in PARTS)
     )  # parts come last
@@ -85,6 +87,46 @@ def schema() -> dict[str, Any]:
 
 def schema_text() -> str:
     return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"
+
+
+def _apart(whole: Schema) -> Schema:
+    """With every section as a definition: pydantic 2.14 writes some in full where they stand."""
+    titles = {f"#/$defs/{name}": section["title"] for name, section in whole["$defs"].items() if "title" in section}
+    sections: dict[str, Schema] = {}
+
+    def named(part: Any) -> Any:
+        if isinstance(part, list):
+            return [named(each) for each in part]
+        if not isinstance(part, dict):
+            return part
+        inner = {key: value if key in ("default", "$defs") else named(value) for key, value in part.items()}
+        if "$ref" in part:
+            inner["$ref"] = titles.get(part["$ref"], part["$ref"])
+        if "properties" not in part or part is whole or not isinstance(part.get("title"), str):
+            return inner
+        sections[part["title"]] = inner
+        return {"$ref": part["title"]}
+
+    found = named(whole)
+    lifted = {name: named(section) for name, section in whole["$defs"].items()}
+    others = {name: section for name, section in lifted.items() if f"#/$defs/{name}" not in titles}
+    short = Counter(title.rsplit(".", 1)[-1] for title in sections)
+    names = {
+        title: last if short[last := title.rsplit(".", 1)[-1]] == 1 else title.replace(".", "__") for title in sections
+    }
+
+    def shortened(part: Any) -> Any:
+        if isinstance(part, list):
+            return [shortened(each) for each in part]
+        if not isinstance(part, dict):
+            return part
+        return {
+            key: f"#/$defs/{names[value]}" if key == "$ref" and value in names else shortened(value)
+            for key, value in part.items()
+        }
+
+    definitions = {names[title]: section for title, section in sections.items()} | others
+    return dict(shortened({**found, "$defs": dict(sorted(definitions.items()))}))
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:

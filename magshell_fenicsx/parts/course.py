@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
     Field(
-        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
-        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
-        "after `points` steps by arc length, or where the load has risen and fallen back to zero: the top of an energy "
-        "barrier, whose height is `barrier` in summary.json (zero)"
+        description="Where the path ends. limit: at the first instability. Where that is a mode which a half or a "
+        "meridian excludes, the path goes on to the model's own first one, but not beyond twice the load; the result "
+        "is still the first. bifurcation: at the first bifurcation; folds are passed. target: at the target. points: "
+        "after `points` steps by arc length. zero: where the load has risen and fallen back to zero, the top of an "
+        "energy barrier, whose height is `barrier` in summary.json"
     ),
 ]
 Prescribed = Literal["load", "conjugate"]

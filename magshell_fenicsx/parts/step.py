@@ -84,8 +84,9 @@ class Step(Section):
     points: int
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
-    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell. With
-    `until: limit` also this step's own amplitude: `conjugate` finds the instability at held volume or displacement"""
+    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell. This
+    step's own amplitude may stand here too if it has `until: limit`: with `conjugate` the instability is that of a
+    shell whose volume or displacement is held, not its load"""
     search: SearchSection | None = None
     """Search for further solutions at the end of the step"""
 

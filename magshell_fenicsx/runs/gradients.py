@@ -94,7 +94,7 @@ def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
 
 def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
     """What the derivatives of a result are contracted with, and of which kind it is."""
-    scene, history = result.scene, result.history
+    scene, history = result.scene, result.walked
     if of in FOLDS:
         return instabilities(scene, history.located, of, 1, history.begins)[0]
     beyond = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)

@@ -3,9 +3,14 @@
 All functions are collective. Results that only rank 0 has are None on other ranks.
 """
 
+import os
+import sys
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from select import select
+from shutil import which
+from subprocess import DEVNULL, PIPE, Popen
+from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
@@ -23,6 +28,9 @@ from magshell_fenicsx.simulate.scene import Scene
 if TYPE_CHECKING:  # take long to import
     import pyvista
     from matplotlib.figure import Figure
+
+STARTING = 20.0  # s in which a virtual display is there
+_displays: list[Popen[bytes]] = []  # the pipes to those that were started
 
 
 def surface(scene: Scene, record: Record) -> Surface | None:
@@ -43,10 +51,46 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
     """The deformed mid-surface in flat triangles, for pyvista, with w_over_h, u_over_h, ... at its points.
 
     `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
-    `plot(scalars="w_over_h")` shows it.
+    `plot(scalars="w_over_h")` shows it, after `off_screen()` also where there is no display.
     """
     found = surface(scene, record)
     return _smooth(found, scene.problem.material.h) if found else None
+
+
+def off_screen() -> None:
+    """Let pyvista draw without windows, also where there is no display; otherwise it ends the whole program there.
+
+    VTK needs a display even for pictures in files. Where `DISPLAY` names none, a virtual one is started (Xvfb, Debian's
+    package xvfb) that lasts as long as this process.
+
+    Raises
+    ------
+    RuntimeError
+        If there is no display and no Xvfb, or it does not start.
+    """
+    import pyvista
+
+    pyvista.OFF_SCREEN = True
+    if os.environ.get("DISPLAY") or sys.platform != "linux":
+        return
+    if not which("Xvfb"):
+        raise RuntimeError("pyvista: finds no display, and there is no Xvfb to make one: install the package xvfb")
+    read, number = os.pipe()
+    made = f"Xvfb -displayfd {number} -noreset -screen 0 1600x1200x24 -nolisten tcp & cat; kill $!"
+    with os.fdopen(read) as shown:
+        try:
+            # the shell waits for this process: a display that ended before VTK has left it would end the process too
+            # a ^C in the terminal is not for the display
+            quiet: dict[str, Any] = {"stdout": DEVNULL, "stderr": DEVNULL, "start_new_session": True}
+            shell = Popen(["sh", "-c", made], stdin=PIPE, pass_fds=[number], **quiet)
+        finally:
+            os.close(number)
+        _displays.append(shell)
+        ready, _, _ = select([shown], [], [], STARTING)
+        said = shown.readline().strip() if ready else ""  # the whole line: Xvfb ends if it cannot write that
+    if not said.isdecimal():
+        raise RuntimeError("pyvista: finds no display, and Xvfb has made none")
+    os.environ["DISPLAY"] = f":{said}"
 
 
 def picture(

@@ -1,6 +1,7 @@
 """Records of a history as rows of path.csv, and as columns."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:
+    import pandas
 
 CLOCK = ("time", "dissipated", "work")
 
@@ -109,11 +113,34 @@ def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
     return [maker.row(record, np.nan) for record in records]
 
 
-def columns(scene: Scene, records: Iterable[Record]) -> dict[str, NDArray[np.generic]]:
-    """The columns of path.csv except the time, each (records,), for instance for `pandas.DataFrame`.
+class Table(dict[str, NDArray[np.generic]]):
+    """Columns by name, each an array (rows,)."""
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """A frame of pandas, which the package does not need otherwise.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            If pandas is not there.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError("to_pandas: needs pandas: python3 -m pip install pandas") from None
+        return pandas.DataFrame(dict(self))
+
+
+def table(found: Sequence[Row], extra: Iterable[str]) -> Table:
+    """The columns of rows, those of every run and extra ones."""
+    return Table({name: np.array([row[name] for row in found]) for name in (*COLUMNS, *extra)})
+
+
+def columns(scene: Scene, records: Iterable[Record]) -> Table:
+    """The columns of path.csv except the time, each (records,); `columns(...).to_pandas()` is a frame of pandas.
 
     Collective.
     """
-    table = rows(scene, records)
-    names = [name for name in (*COLUMNS, *scene.extra_columns) if name != "wall_s"]
-    return {name: np.array([row[name] for row in table]) for name in names}
+    found = table(rows(scene, records), scene.extra_columns)
+    del found["wall_s"]
+    return found

@@ -271,8 +271,8 @@ def _sensitivities(result: Result) -> dict[str, float]:
     step = scene.problem.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
     if step is None or not step.load.wants_sensitivities:
         return {}
-    assert result.history.located
-    record = result.history.located[-1]
+    assert result.walked.located
+    record = result.walked.located[-1]
     try:
         fold = fold_at(scene, record)
     except FoldLost as e:
@@ -282,11 +282,11 @@ def _sensitivities(result: Result) -> dict[str, float]:
 
 def _barrier(result: Result) -> float | None:
     """The energy barrier that the last step has passed, if it was to."""
-    steps, begin = result.scene.problem.programme, result.history.begin
+    steps, begin = result.scene.problem.programme, result.walked.begin
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
-    assert result.history.last
-    return barrier(result.scene, steps[-1], begin.point.state, result.history.last.point.state)
+    assert result.walked.last
+    return barrier(result.scene, steps[-1], begin.point.state, result.walked.last.point.state)
 
 
 def _follow(
@@ -300,13 +300,13 @@ def _follow(
                 files.begin()
             assert files.journal
             scene.journal = Stoppable(files.journal, watch)  # before the first solve of a step
-        result.history.add(record)
+        result.walked.add(record)
         row = made.row(record, time.perf_counter() - start)
         result.rows.append(row)
         if record.label == SOLUTION:
             result.found[len(result.rows) - 1] = record.point.state
         else:
-            result.last, result.end = record.point.state, len(result.rows) - 1
+            result.latest, result.last, result.end = record, record.point.state, len(result.rows) - 1
         if wanted(scene.problem.frequencies, len(result.rows) - 1):
             result.kept[len(result.rows) - 1] = record.point.state
         if record.label in LOCATED:

@@ -17,10 +17,12 @@ from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shape.sections import ShellSection, Surface
 from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 
@@ -71,7 +73,7 @@ class Result:
         Sensitivities of the amplitude at the final fold, if the case requests them; see `simulate.sensitivity`.
     adapted
         The mesh and its error estimate, if the case has a tolerance.
-    history
+    walked
         The records that `value` is taken from.
     end
         Number of the row of `last`.
@@ -90,6 +92,8 @@ class Result:
     largest
         By row number of an instability the undeformed place where its mode moves most along the normal, in the shell's
         length; on rank 0, and not of a meridian, whose modes have rings.
+    latest
+        The record of `last`; None before the first.
     """
 
     scene: Scene
@@ -102,7 +106,7 @@ class Result:
     sensitivities: dict[str, float] = field(default_factory=dict)
     output: Stopwatch = field(default_factory=Stopwatch)
     adapted: Adapted | None = None
-    history: History = field(default_factory=History)
+    walked: History = field(default_factory=History)
     barrier: float | None = None
     end: int = 0
     found: dict[int, State] = field(default_factory=dict)
@@ -111,6 +115,23 @@ class Result:
     contact_changes: dict[int, list[float]] = field(default_factory=dict)
     gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
     largest: dict[int, list[float]] = field(default_factory=dict)
+    latest: Record | None = None
+
+    @property
+    def history(self) -> Table:
+        """The columns of path.csv; `history.to_pandas()` is a frame of pandas."""
+        return table(self.rows, self.scene.extra_columns)
+
+    @property
+    def record(self) -> Record:
+        """The last point of the path, as `follow` gives it: for `picture`, `surface`, `gradient`, and for its `u`."""
+        assert self.latest, "a run has a first point"
+        return self.latest
+
+    @property
+    def instabilities(self) -> list[Record]:
+        """The same of the located instabilities on the path."""
+        return list(self.walked.located)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -157,7 +178,7 @@ class Result:
     def value(self) -> float | None:
         """The scalar result that mesh.tolerance refers to; None if the run has none."""
         try:
-            return self.history.ending(self.scene, self.stopped).value
+            return self.walked.ending(self.scene, self.stopped).value
         except NoResult:
             return None
 

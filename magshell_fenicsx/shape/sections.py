@@ -345,7 +345,7 @@ class OneShape(Section):
     defect: Dimple | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
     width: float | None = Field(default=None, gt=0, le=10)
-    """Of a strip, which must have one [length of the strip]"""
+    """Of a strip, which must have one, over its length: a number without unit [length of the strip]"""
 
 
 class ShellSection(ShellKeys, OneShape):

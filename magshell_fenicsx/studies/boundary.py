@@ -5,6 +5,7 @@ import copy
 import hashlib
 import json
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -38,7 +39,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.varied import Varied, instability
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.points import value_at
-from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
+from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
 
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
@@ -174,7 +175,8 @@ def boundary(
     source = from_first(comm, lambda: read_source(Path(file), settings))
     folder, name = given_folder(out), Path(file).name
     once: Say = say if comm.rank == 0 else lambda line: None
-    with FOLDER.held(folder, comm, name):
+    with FOLDER.held(folder, comm, name), heard(comm, once) as once:
+        say = once if comm.rank == 0 else say
         journal = partial(_Journal, folder / "points", _identity(source, span, made))
         value = _value(source, span, made)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say))
@@ -344,12 +346,15 @@ def _followed(
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     curve = Boundary(varied, varied.name, varied.kind, scales, own.recorded)
     rows: list[dict[str, Any]] = []
+    begun, end = time.perf_counter(), span.ends[sense > 0]
 
     def take(label: Label, locus: Locus) -> None:
         row = _row(varied, label, locus)
         rows.append(row)
+        part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
+        left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
         beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
-        say(f"{span.key} = {span.text(row['key'])}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}")
+        say(f"{span.key} = {span.text(row['key'])}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
 
     try:
         start = curve.start(value, *varied.start())

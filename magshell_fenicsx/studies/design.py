@@ -38,7 +38,7 @@ from magshell_fenicsx.studies.design_picture import Reached, draw_design, reache
 from magshell_fenicsx.studies.design_variables import Variables, variables
 from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
 from magshell_fenicsx.studies.points import identity
-from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, keep, kept, rest_said
+from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, heard, keep, kept, rest_said
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
@@ -197,7 +197,8 @@ def design(
         with FOLDER.held(folder, comm, Path(file).name):
             if resume and not by_first(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
-            return _designed(Design(vary, wanted, folder, comm, say), Path(file), comm)
+            with heard(comm, say) as told:
+                return _designed(Design(vary, wanted, folder, comm, told), Path(file), comm)
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
 
@@ -341,7 +342,7 @@ def _value(result: Result, name: str) -> float | None:
         return None
     row = result.rows[-1]
     try:
-        omega2 = vibration_at_end(result.scene, result.history, name)
+        omega2 = vibration_at_end(result.scene, result.walked, name)
     except Lost:
         return None
     return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2

@@ -6,6 +6,7 @@ deals the missing runs to the ranks, and says how far it is. What these sources 
 
 import json
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +24,9 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import DiskError, held_folder, prepare_folder, refuse_others
 from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.runs.status import clock
 from magshell_fenicsx.runs.summary import Result, in_units, snaps
 from magshell_fenicsx.studies.results import Scalar
 
@@ -35,6 +38,7 @@ Task = TypeVar("Task")
 Found = Literal["path", "fold"]
 FAILED = "failed: "  # what `stopped` begins with if an error ended the run
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
+EACH = terminal.EACH  # s
 
 
 @dataclass(frozen=True)
@@ -135,11 +139,59 @@ def compute(
     do
         Computes a task, keeps the outcome of each of its runs, and yields a line of text for it.
     """
-    begun = time.perf_counter()
-    with _together(comm):
+    begun, done = time.perf_counter(), 0
+
+    def rest() -> str:
+        return _rest(time.perf_counter() - begun, done, len(tasks)) if done else ""
+
+    with _together(comm), heard(comm, say, rest) as told:
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
-                say(line + _rest(time.perf_counter() - begun, i + 1, len(tasks)))
+                done = i + 1
+                told(line + rest())
+
+
+class Heard:
+    """Says lines; and while it is silent for long inside `with`, that work goes on.
+
+    Parameters
+    ----------
+    rest
+        What is added then: the rest of the time in words.
+    """
+
+    def __init__(self, say: Say, rest: Callable[[], str] = str) -> None:
+        self._say, self._rest, self._ended = say, rest, threading.Event()
+        self._begun = self._last = time.perf_counter()
+
+    def __call__(self, line: str) -> None:
+        self._last = time.perf_counter()
+        self._say(line)
+
+    def remind(self) -> None:
+        """Until `end`."""
+        while not self._ended.wait(max(0.01, self._last + EACH - time.perf_counter())):
+            if (now := time.perf_counter()) - self._last >= EACH:
+                self(f"still computing, {clock(now - self._begun)} so far{self._rest()}")
+
+    def end(self) -> None:
+        self._ended.set()
+
+
+@contextmanager
+def heard(comm: MPI.Comm, say: Say, rest: Callable[[], str] = str) -> Iterator[Say]:
+    """A `Heard`, whose reminders rank 0 says; what is one already stays the only one."""
+    if isinstance(say, Heard) or comm.rank:
+        yield say
+        return
+    told = Heard(say, rest)
+    thread = threading.Thread(target=told.remind, daemon=True)
+    thread.start()
+    try:
+        yield told
+    finally:
+        told.end()
+        thread.join()
 
 
 def rest_said(left: float, about: str = "about ") -> str:

@@ -33,7 +33,7 @@ def plate(columns: int, length: float = 1.0) -> tuple[Array, Cells]:
 def made(nodes: Array, cells: Cells, comm: MPI.Comm = MPI.COMM_SELF) -> mesh.Mesh:
     if comm.rank > 0:
         nodes, cells = nodes[:0], cells[:0]
-    return mesh.create_mesh(comm, cells, nodes, basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)))
+    return mesh.create_mesh(comm, cells, x=nodes, e=basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)))
 
 
 def sides(domain: mesh.Mesh) -> mesh.MeshTags:

@@ -177,7 +177,7 @@ def flat(cell: str, dimension: int = 3) -> mesh.Mesh:
     places = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])[:, :dimension]
     cells = [[0, 1, 2, 3]] if cell == "quadrilateral" else [[0, 1, 2], [1, 3, 2]]
     element = basix.ufl.element("Lagrange", cell, 1, shape=(dimension,))
-    return mesh.create_mesh(MPI.COMM_SELF, np.array(cells), places, element)
+    return mesh.create_mesh(MPI.COMM_SELF, np.array(cells), x=places, e=element)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The runner of many runs: what is kept and what is not, shares, the rest of the time, and one's own study on it."""
 
 import json
+import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -115,3 +117,32 @@ def test_a_study_of_ones_own(tmp_path: Path) -> None:
     assert line([1e-5, 2e-5, 3e-5])[:2] == first
     assert computed == [1e-5, 2e-5, 3e-5]
     assert first[1] == pytest.approx(2 * first[0], rel=1e-3)  # a plate under a small load is linear
+
+
+def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the rest of the time once it is known, and never beside a line that was just said; nested, once."""
+    monkeypatch.setattr(runner, "EACH", 0.2)
+    said: list[str] = []
+
+    def slow(number: int) -> Iterator[str]:
+        time.sleep(0.5)
+        yield f"{number} done"
+
+    with runner.heard(MPI.COMM_SELF, said.append) as told:
+        compute([1, 2], slow, MPI.COMM_SELF, told)
+    reminders = [line for line in said if line.startswith("still computing, 0:0")]
+    assert 2 <= len(reminders) <= 4
+    assert [line for line in said if line not in reminders] == ["1 done", "2 done"]
+    assert said[0] in reminders
+    before = len(said)
+    time.sleep(0.5)
+    assert len(said) == before, "it ends with the work"
+
+
+def test_reminders_have_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "EACH", 0.1)
+    said: list[str] = []
+    with runner.heard(MPI.COMM_SELF, said.append, lambda: ", about 2 h left"):
+        time.sleep(0.35)
+    assert said
+    assert all(re.fullmatch(r"still computing, 0:00 so far, about 2 h left", line) for line in said)

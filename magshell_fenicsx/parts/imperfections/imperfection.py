@@ -249,7 +249,8 @@ class LocalSection(ImperfectionSection):
     amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
     width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
-    """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2); with a unit R φo, R φg"""
+    """Half-width. A number is φo of a dimple, or φg of a Gaussian one, in radians times (√(12(1 - ν²)) R/h)^(1/2); a
+    length with a unit is R φo, or R φg"""
     at: At = At.model_construct()
     """Its centre"""
 

@@ -45,8 +45,8 @@ class RampHistory(Section):
 
     kind: Literal["ramp"]
     to: Level
-    """Value at its end: of the field a flux density or a part of that in `magnetic`, otherwise as the load's target, of
-    a spin the speed"""
+    """Value at its end. Of the field: a flux density, or a part of that in `magnetic`. Of a spin: the speed. Of every
+    other load: the number that its target would have without a unit, such as 0.5 of p_c"""
     over: Time
     """Time that it takes"""
 
