@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.mesh.patch import Deviation, GivenField
+from magshell_fenicsx.models.shell.laminate import Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 from magshell_fenicsx.models.shell.rubber import Rubber
 from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.laminate import Laminate
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.natural.shape import Natural
@@ -38,15 +40,18 @@ RemanenceLaw = Literal["deformation", "rotation"]
 
 @dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2."""
+    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units."""
 
     nu: float
     h: float
     rubber: float | None = None
+    laminate: Laminate | None = None
 
     @property
     def law(self) -> Law:
         """How a shell of it resists strains."""
+        if self.laminate:
+            return Laminated.of(self.laminate, self.h, self.nu)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property

@@ -309,7 +309,7 @@ class EnergyFactory:
         """The density of the material with the thickness as it varies, and of the natural shape, if there is one."""
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
-        density = elastic(density, type(law)(*numbers), self.thickness)
+        density = elastic(density, law.with_numbers(*numbers), self.thickness)
         return grown(density, self.natural) if self.natural else density
 
     @property

@@ -127,7 +127,9 @@ class Stresses:
     """
 
     def __init__(self, r0: Array, material: Material, thickness: Array | None, natural: Natural | None = None) -> None:
-        self.frame, self._law, self._thickness = TangentFrame.of(r0), material.law, thickness
+        self.frame = frame = TangentFrame.of(r0)
+        self._thickness = thickness
+        self._law = material.law.at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
         self._natural = natural and natural.at(r0[0], self.frame.n0)
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
