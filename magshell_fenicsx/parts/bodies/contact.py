@@ -3,8 +3,8 @@
 The gap between a body and the shell's face is g(x - a d) - t h/2, with the body's signed distance g at approach zero,
 its approach a along d, the place x of the mid-surface and the factor t of the thickness. The penalty psi(-gap) is zero
 where the gap is open. As of an applied field (`applied`), the polynomial of second order in y = u - a d at the present
-y has the derivatives of the penalty itself, by the displacement and by the approach, for every shape of a body. Where the
-thickness varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the polynomial.
+y has the derivatives of the penalty itself, by the displacement and by the approach, for every shape of a body. Where
+the thickness varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the polynomial.
 """
 
 from collections.abc import Callable, Mapping
