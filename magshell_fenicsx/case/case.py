@@ -159,10 +159,10 @@ class Case(WithParts):
                 f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; "
                 f"with shell.law: {self.shell.law} give full"
             )
-        if self.sensors and self.shell.law != "koiter":
+        if self.sensors and self.shell.law != "koiter" and self.natural and self.natural.stretch is not None:
             raise ValueError(
-                f"sensors: need shell.law: koiter: the field of a shell that gets thinner, as with {self.shell.law}, "
-                "is not built"
+                f"sensors: with shell.law: {self.shell.law} and natural.stretch: the field of a shell whose volume "
+                "grows is not built"
             )
         if self.shell.laminate:
             self._refuse_unfit_laminate(self.shell.laminate)
