@@ -21,6 +21,7 @@ from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.kinds import Bodies
+from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
@@ -158,11 +159,13 @@ class Case(WithParts):
                 f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; "
                 f"with shell.law: {self.shell.law} give full"
             )
-        if self.sensors and self.shell.law != "koiter":
+        if self.sensors and self.shell.law != "koiter" and self.natural and self.natural.stretch is not None:
             raise ValueError(
-                f"sensors: need shell.law: koiter: the field of a shell that gets thinner, as with {self.shell.law}, "
-                "is not built"
+                f"sensors: with shell.law: {self.shell.law} and natural.stretch: the field of a shell whose volume "
+                "grows is not built"
             )
+        if self.shell.laminate:
+            self._refuse_unfit_laminate(self.shell.laminate)
         layers = self.remanent.layers if self.remanent else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -170,6 +173,16 @@ class Case(WithParts):
                 "knows no more of them"
             )
         return self
+
+    def _refuse_unfit_laminate(self, laminate: LaminateSection) -> None:
+        laminate.refuse_unfit_units(self.shell)
+        if self.model == "solid":
+            raise ValueError("shell.laminate: is of a shell: take model: shell")
+        if laminate.twists and "symmetry" in self.boundary.conditions().values():
+            raise ValueError(
+                "boundary: symmetry: no plane mirrors a laminate that twists: for each ply lay one at -angle, at the "
+                "same distance from the middle, or model the whole shell"
+            )
 
     @model_validator(mode="after")
     def _imperfections_fit(self) -> Self:

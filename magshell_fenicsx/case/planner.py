@@ -26,6 +26,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_fr
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
+from magshell_fenicsx.parts.laminate import laminate_leaves, laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
@@ -145,7 +146,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         context=context,
         mesh=case.mesh,
         body=body_of(context),
-        material=material,
+        material=replace(material, laminate=laminate_of(case.shell, turn)),
         loads=all_loads,
         conditions=conditions,
         meridian=span,
@@ -199,6 +200,7 @@ def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leave
     context = case.context
     return [
         of_shape(case.shell, drawn),
+        *laminate_leaves(case.shell, drawn),
         *(leaves for section in context.abilities for leaves in section.leaves(context, drawn)),
         *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
         of_points(case.points.values(), case.shell.reference, drawn),

@@ -11,6 +11,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_val
 from magshell_fenicsx.input.section import Chosen, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
+from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import Branches, Time
 
@@ -60,6 +61,8 @@ class ShellKeys(Section):
     """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6 (C10 + C01)"""
     mooney: float | None = Field(default=None, ge=0, le=1000)
     """C01/C10 of law: mooney-rivlin"""
+    laminate: LaminateSection | None = None
+    """Plies in place of one isotropic material, with law: koiter"""
     viscosity: Time | None = None
     """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
     relaxation: Branches = Field(default=[])
@@ -75,6 +78,10 @@ class ShellKeys(Section):
             )
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
+        if self.laminate and self.law != "koiter":
+            raise ValueError(f"laminate: needs law: koiter: its strains are small; here the law is {self.law}")
+        if self.laminate and (self.viscosity is not None or self.relaxation):
+            raise ValueError("laminate: has no viscosity and no relaxation: these are of one isotropic material")
         return self
 
     @property

@@ -5,6 +5,7 @@ from math import degrees
 
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
+from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
@@ -74,7 +75,9 @@ def _imperfections(context: Context, rims: int) -> str:
 
 
 def _of_shell(context: Context) -> str:
-    rubber = context.shell.rubber
+    rubber, laminate = context.shell.rubber, context.shell.laminate
+    if laminate:
+        return laminate_account(laminate, context.shell)
     if rubber is None:
         return "membrane and bending energy"
     law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"

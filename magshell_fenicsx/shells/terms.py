@@ -37,7 +37,9 @@ from magshell_fenicsx.parts.bodies.contact import (
     contact_energy,
     contact_pressure,
     pressed_radius,
+    thinned_energy,
 )
+from magshell_fenicsx.parts.bodies.thinning import thinning
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
@@ -281,9 +283,12 @@ class EnergyFactory:
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
         carrier, approach = self.carrier, self.free.setdefault(contact.amplitude, self._constant(0.0))
-        rule = carrier.contact_rule
-        known = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness)
-        density = Density(per_area(contact_energy), known.parameters, ("r",), quadrature=rule)
+        rule, thins = carrier.contact_rule, self.material.law.thins
+        thins_at = thinning(carrier, self.u, self.natural) if thins else None
+        known = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at)
+        of, parts = (thinned_energy, MOVED) if thins else (contact_energy, ("r",))
+        density = Density(per_area(of), known.parameters, parts, quadrature=rule)
+        density = grown(density, self.natural) if thins and self.natural else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
         by_name = {name: Density(per_area(of), known.parameters, quadrature=rule) for name, of in seen.items()}
@@ -310,7 +315,7 @@ class EnergyFactory:
         """The density of the material with the thickness as it varies, and of the natural shape, if there is one."""
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
-        density = elastic(density, type(law)(*numbers), self.thickness)
+        density = elastic(density, law.with_numbers(*numbers), self.thickness)
         return grown(density, self.natural) if self.natural else density
 
     @property

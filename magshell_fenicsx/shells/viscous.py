@@ -19,7 +19,7 @@ from magshell_fenicsx.models.carriers import Carrier, HeldEdge
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.law import Koiter, work
+from magshell_fenicsx.models.shell.law import Law, work
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
 from magshell_fenicsx.shells.meridian import MeridianModel
@@ -235,7 +235,7 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     factory, carrier, field = model.factory, model.factory.carrier, given.field
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
 
-    def law(side: str = "") -> Koiter:
+    def law(side: str = "") -> Law:
         """That of the shell at small strains, which a viscous stress follows too."""
         of_shell = model.material.law.linear
         return of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])

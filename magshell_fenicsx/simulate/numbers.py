@@ -21,6 +21,7 @@ from magshell_fenicsx.simulate.scene import Scene
 
 OF_MATERIAL = (
     "density",
+    "laminate",
     "mooney",
     "poisson_ratio",
     "radius_to_thickness",
@@ -58,6 +59,8 @@ def number_of(context: Context, key: str) -> float:
         raise CaseError(f"{key}: is a whole number: it has no gradient")
     if key.startswith("magnetic.remanent.layers.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the layers add up to 1: one alone has no gradient")
+    if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
+        raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
     section, _, rest = key.partition(".")
     geometry = section == "shell" and rest.split(".")[0] not in (*OF_MATERIAL, *OF_DEVIATION)
     if section in ELSEWHERE or geometry:

@@ -51,6 +51,17 @@ def test_an_impact_conserves_energy(symmetry: str) -> None:
 
 
 @pytest.mark.slow
+def test_an_impact_of_rubber_conserves_energy() -> None:
+    """Whose face comes nearer to its middle while the ball presses."""
+    rubber = PLATE | {"shell": PLATE["shell"] | {"poisson_ratio": 0.5, "law": "neo-hookean"}}
+    moving = THROWN | {"duration": 2.0, "step": 0.05, "rho_inf": 1.0}
+    _, found = found_of(rubber, APART, moving, symmetry="axisymmetric")
+    assert max(row["force"] for row in found) > 0
+    for row in found[2:]:
+        assert abs(row["imbalance"]) < 1e-7 * (row["kinetic"] + row["stored"])
+
+
+@pytest.mark.slow
 def test_steps_see_the_balance() -> None:
     """Numerical damping after an impact loses less than was asked; fixed long steps lose more, and the run says so."""
     case, found = found_of(PLATE, APART, THROWN | {"duration": 2.0}, symmetry="axisymmetric")

@@ -49,6 +49,8 @@ class Density:
         Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on cells.
     quadrature
         Degree of its rule on cells; None for `cell_quadrature`.
+    still
+        Further parts of the placement's jet alone.
     """
 
     of: Callable[..., Expr]
@@ -59,6 +61,12 @@ class Density:
     sides: int = 1
     work: Callable[..., Expr] | None = None
     quadrature: int | None = None
+    still: tuple[str, ...] = ()
+
+    @property
+    def jet_parts(self) -> tuple[str, ...]:
+        """All that must be known of jets."""
+        return *self.parts, *self.still
 
     @property
     def on_edges(self) -> bool:

@@ -34,6 +34,8 @@ class Law(ABC):
         What multiplies the thickness.
     thins
         Whether the thickness follows from the area, so that the volume stays.
+    by_place
+        Whether directions depend on the place itself.
     """
 
     h: Scalar
@@ -42,9 +44,21 @@ class Law(ABC):
     thins: ClassVar[bool] = False
 
     @property
-    def numbers(self) -> tuple[Scalar, ...]:
-        """All but `t`, in their order."""
+    def numbers(self) -> tuple[Any, ...]:
+        """All but `t`, in their order; some laws have vectors among them."""
         return self.h, self.number
+
+    def with_numbers(self, *numbers: Any) -> Self:
+        """The same law with others, and `t` of 1."""
+        return type(self)(*numbers)
+
+    @property
+    def by_place(self) -> bool:
+        return False
+
+    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+        """The law at an undeformed place (..., 3) with these tangents and a normal of any length: of directions."""
+        return self
 
     def thicker(self, factor: Scalar) -> Self:
         """That of a shell so many times as thick."""
@@ -52,7 +66,7 @@ class Law(ABC):
 
     @property
     @abstractmethod
-    def linear(self) -> "Koiter":
+    def linear(self) -> "Law":
         """The same at small strains."""
 
     @property
@@ -179,8 +193,9 @@ def elastic(density: Density, law: Law, t: Parameter | None = None) -> Density:
             factor = given.pop()
             factors = [each[0] for each in (factor if density.sides == 2 else [factor])]
         count = len(given) - len(law.numbers)
-        laws = tuple(type(law)(*given[count:]).thicker(each) for each in factors)
+        laws = tuple(law.with_numbers(*given[count:]).thicker(each) for each in factors)
         return density.of(*given[:count], law=laws if density.sides == 2 else laws[0], **known)
 
     numbers = (*density.parameters, *law.numbers)
-    return replace(density, of=of, parameters=numbers if t is None else (*numbers, t))
+    parameters = numbers if t is None else (*numbers, t)
+    return replace(density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still)

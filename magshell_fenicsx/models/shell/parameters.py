@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
@@ -29,15 +30,18 @@ Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] 
 
 @dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2."""
+    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units."""
 
     nu: float
     h: float
     rubber: float | None = None
+    laminate: Laminate | None = None
 
     @property
     def law(self) -> Law:
         """How a shell of it resists strains."""
+        if self.laminate:
+            return Laminated.of(self.laminate, self.h, self.nu)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property

@@ -119,7 +119,7 @@ class _Cells:
         self.names = [term.name for term in terms]
         X, self._weights = cell_rule(degree)
         table, each = Table.tabulate(V.element.basix_element, X), len(X)
-        parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
+        parts = [name for name in NAMES if name in FIRST or any(name in term.density.jet_parts for term in terms)]
         self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
         cells, frames = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32), cell_frames(V.mesh)
         geometry, count = np.repeat(frames[cells], each, axis=0), len(cells) * each
@@ -170,7 +170,7 @@ class _Edges:
         each = len(self._weights)
         X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
         table = Table.tabulate(V.element.basix_element, X)
-        parts = [name for name in NAMES if name in CURVED or any(name in term.density.parts for term in terms)]
+        parts = [name for name in NAMES if name in CURVED or any(name in term.density.jet_parts for term in terms)]
         self._width = 3 * len(parts)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in parts])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)

@@ -48,7 +48,8 @@ class RevolvedGatherer:
         thick, thick_inside = (
             None if model.thickness is None else swept.scalars(model.thickness, at) for at in (ENDS, self._inner)
         )
-        self._fields = PointFields(r, model.material, loads.magnetic, thick, loads.contacts, loads.remanence)
+        others = loads.contacts, loads.remanence, loads.natural
+        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
         self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
         self._at_ends = Stresses(r, model.material, thick).frame
         if isinstance(model.meridian.embedding, Deviated):

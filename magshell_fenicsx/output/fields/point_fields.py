@@ -128,7 +128,9 @@ class Stresses:
     """
 
     def __init__(self, r0: Array, material: Material, thickness: Array | None, natural: Natural | None = None) -> None:
-        self.frame, self._law, self._thickness = TangentFrame.of(r0), material.law, thickness
+        self.frame = frame = TangentFrame.of(r0)
+        self._thickness = thickness
+        self._law = material.law.at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
         self._natural = natural and natural.at(r0[0], self.frame.n0)
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
@@ -208,6 +210,8 @@ class PointFields:
         Bodies that press.
     remanence
         What is magnetised if there is no field.
+    natural
+        The natural shape, whose volume stays.
 
     Attributes
     ----------
@@ -230,9 +234,11 @@ class PointFields:
         thickness: Array | None,
         contacts: Sequence[Contact] = (),
         remanence: Magnetisation | None = None,
+        natural: Natural | None = None,
     ) -> None:
         self._contacts, self._h, self._thins = contacts, material.h, material.law.thins
         self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
+        self._natural = natural.at(r0[0], self._frame.n0) if natural and contacts and self._thins else None
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
@@ -282,11 +288,22 @@ class PointFields:
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:
-            found["gap_over_h"] = self._gap(frame.jet[0] + u[0], mu)
+            found["gap_over_h"] = self._gap(u, mu)
         return found
 
-    def _gap(self, r: Array, mu: Mapping[str, float]) -> Array:
-        h, factor = self._h, 1.0 if self._thickness is None else self._thickness.ravel()
+    def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
+        """The deformed thickness over the undeformed one; see `parts.bodies.thinning`."""
+        area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
+        stretch = self._frame.area / area
+        if self._natural is None:
+            return np.asarray(stretch)
+        shape = NaturalFrame.of(self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+        return np.asarray(stretch * shape.thickness / np.linalg.det(shape.inverse))
+
+    def _gap(self, u: Array, mu: Mapping[str, float]) -> Array:
+        h, r = self._h, self._frame.jet[0] + u[0]
+        factor = (1.0 if self._thickness is None else self._thickness) * (self._thinned(u, mu) if self._thins else 1.0)
+        factor = np.broadcast_to(factor, r.shape[:-1]).ravel()
         gaps = [c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 

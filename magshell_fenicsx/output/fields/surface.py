@@ -111,7 +111,7 @@ class SurfaceGatherer:
         model, loads = self._model, self._model.loads
         r, inner = self._jet(model.r0, self._places), self._jet(model.r0, self._inner)
         thick, thick_inside = (self._thickness(at) for at in (self._places, self._inner))
-        others = loads.contacts, loads.remanence
+        others = loads.contacts, loads.remanence, loads.natural
         self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
         self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
         self._six = six(self._stresses.frame)

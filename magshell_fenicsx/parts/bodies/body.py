@@ -100,7 +100,8 @@ class Placed:
 class BodySection(Section):
     """Base of all kinds: a rigid body without friction.
 
-    It touches the shell's face, half a thickness from the mid-surface. `kind: contact` moves it; otherwise it stays.
+    It touches the shell's face, half a thickness from the mid-surface (of rubber half the deformed one). `kind:
+    contact` moves it; otherwise it stays.
     """
 
     kind: str

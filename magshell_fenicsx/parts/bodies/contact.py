@@ -1,9 +1,10 @@
 """Rigid bodies that press on the shell: the penalty of the gap by its Taylor polynomial at each quadrature point.
 
-The gap between a body and the shell's face is g(x - a d) - h/2, with the body's signed distance g at approach zero, its
-approach a along d and the place x of the mid-surface. The penalty psi(-gap) is zero where the gap is open. As of an
-applied field (`applied`), the polynomial of second order in y = u - a d at the present y has the derivatives of the
-penalty itself, by the displacement and by the approach, for every shape of a body.
+The gap between a body and the shell's face is g(x - a d) - t h/2, with the body's signed distance g at approach zero,
+its approach a along d, the place x of the mid-surface and the factor t of the thickness. The penalty psi(-gap) is zero
+where the gap is open. As of an applied field (`applied`), the polynomial of second order in y = u - a d at the present
+y has the derivatives of the penalty itself, by the displacement and by the approach, for every shape of a body. Where
+the thickness varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the polynomial.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,14 +21,15 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
+from magshell_fenicsx.parts.bodies.thinning import Thinning, thinned
 
 Array = NDArray[np.float64]
 SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
-FACE = 1 + 1 + 3  # t*, the derivative of psi* by the thickness factor t, and that of its gradient
+FACE = 1 + 1 + 3 + 1  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
 ROUNDING = 1e-5  # of the soft penetration: a smaller change of it is no divisor
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
@@ -108,19 +110,32 @@ def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, A
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
     """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of one.
 
-    Where the thickness varies, its factor (1,) and what psi changes by with it (`FACE`,) are given too.
+    Where the thickness varies, what psi changes by with it (`FACE`,) and its factor (1,) are given too.
     """
     s = _moved(u, P, motion, approach)
+    psi = _polynomial(P, s)
+    return psi + _of_face(face[0], face[1][0], s) if face else psi
+
+
+def thinned_energy(
+    r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, F: Expr, *factor: Expr, natural: Forms | None = None
+) -> Expr:
+    """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies, multiplies."""
+    s, t = _moved(u, P, motion, approach), thinned(r0, u, natural)
+    return _polynomial(P, s) + _of_face(F, factor[0][0] * t if factor else t, s)
+
+
+def _polynomial(P: Expr, s: Expr) -> Expr:
     pairs = enumerate(zip(*PAIRS, strict=True))
-    second = sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
-    psi = P[3] + ufl.dot(_gradient(P), s) + second
-    if not face:
-        return psi
-    t, F = face
-    return psi + (t[0] - F[0]) * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s))
+    return P[3] + ufl.dot(_gradient(P), s) + sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
 
 
-def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
+def _of_face(F: Expr, t: Expr, s: Expr) -> Expr:
+    more = t - F[0]
+    return more * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + more / 2 * F[5])
+
+
+def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **known: Forms) -> Expr:
     """The pressure on the shell per undeformed area, at the state of P."""
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
@@ -200,6 +215,8 @@ class Pressing:
         Of the quadrature.
     thickness
         What multiplies h; None for 1.
+    thinning
+        How thick the deformed shell is over that, see `thinning`; None for 1.
 
     Attributes
     ----------
@@ -220,6 +237,7 @@ class Pressing:
         approach: fem.Constant,
         degree: int,
         thickness: fem.Function | None = None,
+        thinning: Thinning | None = None,
     ) -> None:
         V = u.function_space
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
@@ -228,25 +246,29 @@ class Pressing:
         self._r0 = Follows(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
         thick = [] if thickness is None else [thickness.x.array]
 
-        def factor() -> float | Array:
-            return 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+        thins = thinning and thinning(self._points)
 
-        self._factor = Follows(factor, lambda: (*thick,))
-        self._face = None if thickness is None else PointField(V.mesh, degree, FACE)
+        def factor() -> float | Array:
+            given = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+            return given if thins is None else given * thins.renew()
+
+        self._factor = Follows(factor, lambda: (*thick, *([thins.renew()] if thins else [])))
+        self._face = None if thickness is None and thins is None else PointField(V.mesh, degree, FACE)
         motion = fem.Constant(V.mesh, h * contact.direction)
-        self.parameters = (self.polynomial, motion, approach, *(() if self._face is None else (thickness, self._face)))
+        varying = () if thickness is None else (thickness,)
+        self.parameters = (self.polynomial, motion, approach, *(() if self._face is None else (self._face, *varying)))
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        self._mean: tuple[Array, ...] = ()  # gradient and Hessian of a step, in place of the present ones
+        self._mean: tuple[Array, ...] = ()  # derivatives of a step by place and thickness, in place of the present ones
         self._about: tuple[Array, ...] = ()  # the gap about which the penalty is expanded
 
         def places() -> tuple[Array, ...]:
-            return r0.x.array, u.x.array, approach.value, *thick
+            return r0.x.array, u.x.array, approach.value, *thick, *([thins.renew()] if thins else [])
 
         def forces() -> tuple[Array, ...]:
             return *places(), self.stiffness.value, *self._mean, *self._about
 
-        self._gaps = Follows(lambda: self._gap_at(self.place), places)
+        self._gaps = Follows(lambda: self._gap_at(self.place, self.factor), places)
         self._pressed = Follows(self._expanded, forces)
         self.polynomial.follow(self._polynomials, forces)
         if self._face is not None:
@@ -267,9 +289,9 @@ class Pressing:
         """At all points, over R."""
         return self._gaps.renew()[0]
 
-    def _gap_at(self, y: Array) -> tuple[Array, Array, Array]:
-        """The gap and its derivatives at places `place`."""
-        return self.contact.gap((self._r0.renew() + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor.renew())
+    def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
+        """The gap and its derivatives at places `place`, of a shell so many times as thick."""
+        return self.contact.gap((self._r0.renew() + y).reshape(-1, 3), 0.0, self._h / 2 * factor)
 
     def _expanded(self) -> "_Expanded":
         """The penalty where points are pressed, few of all."""
@@ -293,15 +315,18 @@ class Pressing:
         return flat
 
     def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
-        gradient, H = self._mean
+        gradient, H, _ = self._mean
         return np.ones(len(gradient), dtype=bool), _flat(np.zeros((len(gradient), 1)), gradient, H)
 
     def _by_thickness(self) -> Array:
         """The factor of the thickness, and what psi changes by with it."""
-        at = self._pressed.renew()
+        at, half = self._pressed.renew(), self._h / 2
         by_t = np.zeros((len(at.pressed), FACE))
-        by_t[:, 0] = self._factor.renew()
-        by_t[at.pressed, 1:] = self._h / 2 * np.concatenate([at.first, -at.second * at.n], axis=1)
+        by_t[:, 0] = self.factor
+        if self._mean:
+            by_t[:, 1:] = self._mean[2]
+        else:
+            by_t[at.pressed, 1:] = half * np.concatenate([at.first, -at.second * at.n, half * at.second], axis=1)
         return by_t.reshape(*self.polynomial.values.shape[:2], FACE)
 
     def expand_about(self, gap: Array) -> None:
@@ -316,7 +341,17 @@ class Pressing:
         """y = u - a d at the points, (cells, points, 3)."""
         return at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
 
-    def average(self, begin: Array, end: Array, part: float) -> None:
+    @property
+    def factor(self) -> float | Array:
+        """The thickness over h at the points, (cells * points,) where it varies."""
+        return self._factor.renew()
+
+    @property
+    def where(self) -> tuple[Array, float | Array]:
+        """`place` and `factor`."""
+        return self.place, self.factor
+
+    def average(self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float) -> None:
         """Take the forces of a step in place of the present ones, until `present`; see docs/theory.md, Motion.
 
         Their product with the change of y is that of psi, plus what the step dissipates: the mean gradient is that of
@@ -325,12 +360,13 @@ class Pressing:
         Parameters
         ----------
         begin, end
-            `place` at both ends of the step.
+            `where` at both ends of the step.
         part
             Of the step at which the system has its forces.
         """
-        k, soft, places = float(self.stiffness.value), SOFT * self._h, (begin, (begin + end) / 2, end)
-        gaps, n, N = zip(*(self._gap_at(y) for y in places), strict=True)
+        k, soft, half = float(self.stiffness.value), SOFT * self._h, self._h / 2
+        middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
+        gaps, n, N = zip(*(self._gap_at(*where) for where in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
         mean, slope = mean_pressure(s0, s1, k, soft)
         normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
@@ -345,7 +381,10 @@ class Pressing:
         late = part - 0.5
         gradient = -times(mean, normal) - late * (times(p1, n[2]) - times(p0, n[0]))
         H = times(slope, outer(normal)) - times(mean, bend) + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
-        self._mean = gradient, np.asarray(H / part)
+        by_t = half * (mean + late * (p1 - p0))
+        of_both = -half * (times(slope, normal) + late * times(stiff, n[2])) / part
+        twice = half**2 * (slope + late * stiff) / part
+        self._mean = gradient, np.asarray(H / part), np.column_stack([by_t, of_both, twice])
 
     def present(self) -> None:
         """Take the present forces again."""
@@ -383,22 +422,22 @@ class Pressings:
 
     def __init__(self, system: FiniteElementSystem, pressings: Mapping[str, Pressing]) -> None:
         self._system, self._pressings, self.names = system, list(pressings.values()), frozenset(pressings)
-        self._begin: tuple[Vector, list[Array]] | None = None
+        self._begin: tuple[Vector, list[tuple[Array, float | Array]]] | None = None
 
     def along(self, begin: State, end: State, part: float) -> None:
         """Take the forces of a step at a part of it, see `Pressing.average`."""
         if self._begin is None or self._begin[0] is not begin.u:
             self._begin = begin.u, self._places(begin)
-        for pressing, y0, y1 in zip(self._pressings, self._begin[1], self._places(end), strict=True):
-            pressing.average(y0, y1, part)
+        for pressing, before, after in zip(self._pressings, self._begin[1], self._places(end), strict=True):
+            pressing.average(before, after, part)
 
     def present(self) -> None:
         """Take the present forces again."""
         for pressing in self._pressings:
             pressing.present()
 
-    def _places(self, state: State) -> list[Array]:
-        return self._system.at(state).of(lambda: [pressing.place for pressing in self._pressings])
+    def _places(self, state: State) -> list[tuple[Array, float | Array]]:
+        return self._system.at(state).of(lambda: [pressing.where for pressing in self._pressings])
 
     def stored(self, u: Vector, mu: Amplitudes) -> float:
         """The energy of the shell itself with that of the contacts."""

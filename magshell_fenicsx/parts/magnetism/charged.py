@@ -38,6 +38,8 @@ class Shape:
         What multiplies it, with its element; None for 1.
     swept
         Whether the cells are those of a meridian.
+    thins
+        Whether the thickness follows from the area, so that the volume stays.
     """
 
     element: Any
@@ -48,6 +50,7 @@ class Shape:
     h: float
     thick: tuple[Any, Array] | None = None
     swept: bool = False
+    thins: bool = False
 
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
         """Places on the reference cell of coordinates (n, m, 2), their derivatives (n, m, 2, d), and azimuths (n, m).
@@ -138,16 +141,25 @@ class Jets:
         t, t1, t2 = (each[..., None] for each in self.t)
         return a1 + eta * (t * n1 + t1 * n0), a2 + eta * (t * n2 + t2 * n0), t * n0
 
+    @property
+    def thickness(self) -> Array:
+        """(n, m) of the deformed shell, over R."""
+        if not self.shape.thins:
+            return np.asarray(self.t[0])
+        area0, area = (np.linalg.norm(np.cross(a[1], a[2]), axis=-1) for a in (self.r0, self.r))
+        return np.asarray(self.t[0] * area0 / area)
+
     def place(self, eta: float) -> Array:
         """(n, m, 3) of the deformed shell."""
-        return np.asarray(self.r[0] + eta * self.t[0][..., None] * unit(np.cross(self.r[1], self.r[2])))
+        return np.asarray(self.r[0] + eta * self.thickness[..., None] * unit(np.cross(self.r[1], self.r[2])))
 
     def back(self, into: Nodal, on_x: Array, on_n: Array, on_B: Array) -> None:
         """Add dJ/du and dJ/dB at nodes, from dJ/dr and dJ/dn (n, m, 3) and dJ/d(B, B_a, B_b) (3, n, m, 3)."""
         m = np.cross(self.r[1], self.r[2])
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         n = m / size
-        across = (on_n - np.sum(on_n * n, axis=-1, keepdims=True) * n) / size  # dJ/dm
+        along = 2 if self.shape.thins else 1  # the thickness is over |m| too
+        across = (on_n - along * np.sum(on_n * n, axis=-1, keepdims=True) * n) / size  # dJ/dm
         on = np.stack([on_x, np.cross(self.r[2], across), np.cross(across, self.r[1])])
         if self.shape.swept:
             on, on_B = (np.stack([turned(each, self.angle, -1.0) for each in part]) for part in (on, on_B))

@@ -180,7 +180,7 @@ class Faces(Family):
         d, n = x - foot.r[0], unit(np.cross(foot.r[1], foot.r[2]))
         across = np.sum(d * n, axis=-1)
         beside = np.linalg.norm(d - across[..., None] * n, axis=-1)
-        return bool(((np.abs(across) <= foot.t[0] / 2) & (beside < BESIDE)).any())
+        return bool(((np.abs(across) <= foot.thickness / 2) & (beside < BESIDE)).any())
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at = self._jets(boxes, x)
@@ -227,7 +227,7 @@ class Sides(Family):
     def middle(self, boxes: Boxes, x: Array) -> Array:
         at, _, eta = self._jets(boxes, x)
         n = unit(np.cross(at.r[1], at.r[2]))
-        return np.asarray(at.r[0] + (eta * at.t[0])[..., None] * n)[:, :, None]
+        return np.asarray(at.r[0] + (eta * at.thickness)[..., None] * n)[:, :, None]
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at, along, eta = self._jets(boxes, x)
@@ -247,13 +247,14 @@ def _through() -> tuple[Array, Array]:
 def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], into: Nodal | None) -> Found:
     """Charges of layers, each with its height and with what B, B_a and B_b are multiplied by."""
     n = unit(np.cross(at.r[1], at.r[2]))
-    x = np.stack([at.r[0] + eta * at.t[0][..., None] * n for eta, _ in layers], axis=2)
+    thickness = at.thickness[..., None]
+    x = np.stack([at.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
     q = np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
     if into is None:
         return Found(x, q)
 
     def back(on_x: Array, on_q: Array) -> None:
-        heights = np.stack([eta * at.t[0][..., None] + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
+        heights = np.stack([eta * thickness + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
         by_B = [sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)]
         at.back(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
 

@@ -54,6 +54,7 @@ class OwnField:
         pattern = found.remanent if callable(found.remanent) else Uniform(np.asarray(found.remanent))
         self.Br = pattern_field(pattern, sight.model.r0)[0]
         self._thickness = sight.model.thickness
+        self._thins = sight.model.material.law.thins
         self._plain = found.law == "deformation" and found.soft is None
         if not self._plain:
             carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
@@ -113,9 +114,9 @@ class OwnField:
         if self._plain:
             Q = self.Br.function_space
             of, B = Q.element.basix_element, self._nodal()
-            return Shape(element, r0, u, of, B, model.material.h, thick, size == 2)
+            return Shape(element, r0, u, of, B, model.material.h, thick, size == 2, self._thins)
         Beff = self._material(self._jets(r0), self._jets(u), mu)
-        return Shape(element, r0, u, self._at, Beff, model.material.h, thick, size == 2)
+        return Shape(element, r0, u, self._at, Beff, model.material.h, thick, size == 2, self._thins)
 
     def _nodal(self, cells: int | None = None) -> Array:
         """The remanence at the nodes of cells."""
@@ -141,8 +142,8 @@ class OwnField:
         if not (of.soft and of.soft.alone):
             Q = self.Br.function_space
             T = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
-            carried = frame.convected if of.law == "deformation" else frame.rotated
-            J = carried(np.einsum("mk,nki->nmi", T, self._nodal()), u)
+            Br = np.einsum("mk,nki->nmi", T, self._nodal())
+            J = frame.convected(Br, u, thins=self._thins) if of.law == "deformation" else frame.rotated(Br, u)
         if of.soft:
             B = of.at(mu, r0[0] + u[0])
             J = J + of.soft.scale**2 * of.soft.polarisation(r0[0], frame.n0, n, B)
@@ -150,7 +151,10 @@ class OwnField:
         m = np.cross(r1, r2)
         area = np.sum(m * n, axis=-1, keepdims=True)
         first, second = (np.sum(each * J, axis=-1, keepdims=True) / area for each in (np.cross(r2, n), np.cross(n, r1)))
-        return np.asarray(first * r0[1] + second * r0[2] + np.sum(n * J, axis=-1, keepdims=True) * frame.n0)
+        across = np.sum(n * J, axis=-1, keepdims=True)
+        if self._thins:  # over the stretch of the thickness
+            across = across * area / frame.area[..., None]
+        return np.asarray(first * r0[1] + second * r0[2] + across * frame.n0)
 
     def _to_material(self, into: Nodal, mu: Mapping[str, float]) -> Nodal:
         """Derivatives by what is magnetised taken on to the displacement and to the remanence."""

@@ -96,19 +96,23 @@ class _TangentEnergy:
         normal = np.cross(first[..., 0, :], first[..., 1, :])
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._a, self._raise, self._strain = first, np.linalg.inv(metric0), (metric - metric0) / 2
+        places = np.einsum("qp,npc->nqc", self._table[0], gathered(scene, model.r0.x.array[: model.system.size]))
+        a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
+        self._law = scene.problem.material.law.at(places, a1, a2, np.cross(a1, a2))
         self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
         self._area = np.sqrt(np.linalg.det(metric0))
 
     def __call__(self, v: Vector) -> Array:
         """(cells,), over E h R^2."""
-        law = self._scene.problem.material.law
+        law = self._law
         first, second = self._derivatives(v)
         E = np.einsum("...ic,...jc->...ij", self._a, first)
-        bent = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
-        K = np.einsum("...c,...ijc->...ij", self._normal, bent)
+        turned = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
+        K = np.einsum("...c,...ijc->...ij", self._normal, turned)
         E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
         slope = work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
-        density = slope / 2 + law.bending(self._strain, K, self._raise)
+        bent = (law.bending(self._strain, S, self._raise) for S in (K, -K))  # without what is linear, of plies
+        density = slope / 2 + sum(bent) / 2
         return np.asarray((density * self._area) @ self._weights)
 
     def _derivatives(self, v: Vector) -> tuple[Array, Array]:

@@ -1,13 +1,24 @@
 """What a law of the material says of stresses and edges follows from its energies, for arrays and for expressions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
+from plies import laminate, ply
 
+from magshell_fenicsx.models.shell.laminate import Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, work
 from magshell_fenicsx.models.shell.rubber import Rubber
 
-LAWS = [Koiter(0.05, 0.3), Koiter(0.1, 0.5).thicker(1.3), Rubber(0.05, 0.0), Rubber(0.1, 0.3).thicker(1.3)]
+COUPLED = Laminated.of(laminate(ply(20, 3.0, fraction=0.3), ply(-70, 0.7)), 0.05, 0.3)
+LAWS: list[Law] = [
+    Koiter(0.05, 0.3),
+    Koiter(0.1, 0.5).thicker(1.3),
+    Rubber(0.05, 0.0),
+    Rubber(0.1, 0.3).thicker(1.3),
+    replace(COUPLED, direction=(0.3, -0.8)).thicker(1.3),
+]
 RNG, STEP = np.random.default_rng(4), 1e-30
 
 

@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, field, moment
 from magshell_fenicsx.parts.registered import SEEN
@@ -164,6 +164,39 @@ def test_a_deformed_cap_against_magpylib(symmetry: str) -> None:
     assert (error < [1e-3, 1e-5, 1e-6]).all(), error
 
 
+@pytest.mark.parametrize("law", ["deformation", "rotation"])
+def test_a_stretched_disc_of_rubber(law: str) -> None:
+    """Magnetised across and stretched by 1.5: a cylinder of the same volume, 1/2.25 as thick; on its axis.
+
+    F takes the remanence down to 1/2.25 too, its rotation leaves it. The cylinder's field is that of two charged discs.
+    """
+    R, h, z = 10 * MM, 0.5 * MM, 3 * MM
+    disc = {
+        "geometry": "disc",
+        "radius": "10 mm",
+        "thickness": "0.5 mm",
+        "youngs_modulus": "1 MPa",
+        "poisson_ratio": 0.5,
+    }
+    case = {
+        "shell": {**disc, "law": "neo-hookean"},
+        "boundary": {"rim": "clamped"},
+        "magnetic": {
+            "remanent": {"polar": 0, "flux_density": "1 T"},
+            "applied": {"flux_density": "1 mT"},
+            "remanence": law,
+        },
+        "sensors": {"hall": {"position": [0, 0, "3 mm"]}},
+        "loading": {"kind": "field"},
+    }
+    scene = Scene(Case.from_source(Source("test", case)))
+    u = 0.5 * scene.model.r0.x.array[: scene.model.system.size]
+    found = scene.observe(State(u, scene.unloaded().mu))["hall_Bz"]
+    half, rim, size = h / 2.25 / 2, 1.5 * R, 1 / 2.25 if law == "deformation" else 1.0
+    up, down = ((z + way * half) / np.hypot(z + way * half, rim) for way in (1, -1))
+    assert found == pytest.approx(size * (up - down) / 2, rel=1e-7)
+
+
 @cache
 def _key(k: int, h: float, B: tuple[float, ...], A: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     return triangles_of_a_cap(k, h, np.array(B), np.array(A).reshape(3, 3))
@@ -196,6 +229,13 @@ KINDS = {
     "meridian, thickness, soft": lambda: made({**CAP, "thickness_factor": "1 + z/4"},
                                               {"susceptibility": 2, "applied": {"flux_density": "30 mT"}},
                                               {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "full, rubber": lambda: made({**CAP, "law": "neo-hookean", "poisson_ratio": 0.5}, FIELD,
+                                 {"hall": {"position": [2 * MM, 1 * MM, 8 * MM]}}, symmetry="none",
+                                 mesh={"degree": 2, "size": 0.4}),
+    "meridian, rubber, rotation law": lambda: made(
+        {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5, "thickness_factor": "1 + z/4"},
+        {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"}, "applied": {"flux_density": "30 mT"},
+         "remanence": "rotation"}, {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
 }  # fmt: skip
 
 
@@ -302,3 +342,9 @@ def test_a_sensor_that_the_shell_reaches() -> None:
     for down, there in ((0.3, True), (1.0, False)):
         moved[:, 2] = -down / 20
         assert np.isfinite(here.observe(State(moved.ravel(), here.unloaded().mu))["hall_Bz"]) == there
+
+
+def test_rubber_that_swells_is_refused() -> None:
+    shell = {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5}
+    with pytest.raises(ValueError, match="the field of a shell whose volume grows is not built"):
+        made(shell, FIELD, {"hall": {"position": [0, 0, 30 * MM]}}, natural={"stretch": 1.1})

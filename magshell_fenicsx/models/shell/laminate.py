@@ -1,0 +1,178 @@
+"""The law of a laminate: Koiter's energies with stiffnesses A, B and D in the directions of its plies.
+
+With z along the normal the layer at z has the strain E - z K, so that the energy per area is
+(E : A : E - 2 E : B : K + K : D : K)/2, A, B, D the integrals of 1, z, z^2 times the stiffness of the plies
+(R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E h^3 are taken out.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor
+
+Array = NDArray[np.float64]
+Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 22 and 12 of a stress, or twice 12 of a strain
+Stiffness: TypeAlias = Any  # 11, 12, 22, 16, 26, 66: numbers, or an expression (6,)
+
+
+@dataclass(frozen=True)
+class Laminate:
+    """What a model needs of the plies: A, B, D (3, 6) and the direction of the angle 0, in the model's frame."""
+
+    matrices: Array = field(repr=False)
+    direction: Array | None
+
+
+@dataclass(frozen=True)
+class Laminated(Law):
+    """Its number is Poisson's ratio of the units.
+
+    Attributes
+    ----------
+    A, B, D
+        Over E h, E h^2 and E h^3.
+    axis
+        The vector (3,) along whose part in the surface the angle 0 is; of meridians it does not count.
+    meridian
+        Whether the angle 0 is along the meridians of e3 in place of `axis`.
+    direction
+        Components, with index down, of the angle 0 at a point, of any length; see `at`.
+    """
+
+    A: Stiffness = field(default=(), kw_only=True)
+    B: Stiffness = field(default=(), kw_only=True)
+    D: Stiffness = field(default=(), kw_only=True)
+    axis: Any = field(default=(1.0, 0.0, 0.0), kw_only=True)
+    meridian: bool = field(default=False, kw_only=True)
+    direction: tuple[Scalar, Scalar] = field(default=(1.0, 0.0), kw_only=True)
+
+    @classmethod
+    def of(cls, laminate: Laminate, h: float, nu: float) -> Self:
+        """That of plies."""
+        A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
+        meridian = laminate.direction is None
+        axis = (0.0, 0.0, 1.0) if laminate.direction is None else tuple(float(v) for v in laminate.direction)
+        return cls(h, nu, A=A, B=B, D=D, axis=axis, meridian=meridian)
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        return self.h, self.number, self.A, self.B, self.D, self.axis
+
+    def with_numbers(self, *numbers: Any) -> Self:
+        names = "h", "number", "A", "B", "D", "axis"
+        return replace(self, t=1, **dict(zip(names, numbers, strict=True)))
+
+    @property
+    def by_place(self) -> bool:
+        return self.meridian
+
+    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+        axis = self.axis
+        if self.meridian:  # (e_theta x n) . a, times lengths
+            x, y, out = r[..., 0], r[..., 1], r[..., 0] * n[..., 0] + r[..., 1] * n[..., 1]
+            one, two = (n[..., 2] * (x * a[..., 0] + y * a[..., 1]) - out * a[..., 2] for a in (a1, a2))
+        else:
+            one, two = (axis[0] * a[..., 0] + axis[1] * a[..., 1] + axis[2] * a[..., 2] for a in (a1, a2))
+        return replace(self, direction=(one, two))
+
+    @property
+    def linear(self) -> Law:
+        return self
+
+    @property
+    def bending_stiffness(self) -> Scalar:
+        return Koiter(self.h, self.number, self.t).bending_stiffness
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        strain = _Frame(self.direction, up).strain(E)
+        return self.t / 2 * _work(_stress(self.A, strain), strain)
+
+    def stress(self, E: Tensor, up: Tensor) -> Components:
+        frame = _Frame(self.direction, up)
+        return frame.raised(self.t, _stress(self.A, frame.strain(E)))
+
+    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
+        return self.stress(change, up)
+
+    def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        frame = _Frame(self.direction, up)
+        stretched, bent = frame.strain(E), frame.strain(K)
+        own, coupled = _work(_stress(self.D, bent), bent), _work(_stress(self.B, bent), stretched)
+        return self._of_D / 2 * own - self._of_B * coupled
+
+    def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        frame = _Frame(self.direction, up)
+        return frame.raised(1, self._moment(frame, E, K))
+
+    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        frame = _Frame(self.direction, up)
+        return _work(self._moment(frame, E, K), frame.twice(across))
+
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        bent = _Frame(self.direction, up).twice(across)
+        return self._of_D * _work(_stress(self.D, bent), bent)
+
+    @property
+    def _of_B(self) -> Scalar:
+        return self.h * self.t**2
+
+    @property
+    def _of_D(self) -> Scalar:
+        return self.h**2 * self.t**3
+
+    def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
+        of_D, of_B = _stress(self.D, frame.strain(K)), _stress(self.B, frame.strain(E))
+        M1, M2, M6 = (self._of_D * d - self._of_B * b for d, b in zip(of_D, of_B, strict=True))
+        return M1, M2, M6
+
+
+class _Frame:
+    """t1 along a direction and t2 = n x t1: orthonormal in the metric whose inverse is `up`."""
+
+    def __init__(self, direction: tuple[Scalar, Scalar], up: Tensor) -> None:
+        (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
+        raised = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
+        over, det = (c1 * raised[0] + c2 * raised[1]) ** -0.5, a11 * a22 - a12**2
+        self._up, self._det = (a11, a12, a22), det
+        self.t1 = raised[0] * over, raised[1] * over
+        self.t2 = -(det**0.5) * c2 * over, det**0.5 * c1 * over
+
+    def strain(self, S: Tensor) -> Triple:
+        """S_11, S_22 and 2 S_12 of a tensor with indices down."""
+
+        def along(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
+            mixed = a[0] * b[1] + a[1] * b[0]
+            return S[..., 0, 0] * a[0] * b[0] + S[..., 0, 1] * mixed + S[..., 1, 1] * a[1] * b[1]
+
+        return along(self.t1, self.t1), along(self.t2, self.t2), 2 * along(self.t1, self.t2)
+
+    def twice(self, across: tuple[Scalar, Scalar]) -> Triple:
+        """The same of c c, where the covector c has these components with index up."""
+        (b1, b2), (a11, a12, a22), det = across, self._up, self._det
+        c = (a22 * b1 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
+        one, two = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
+        return one**2, two**2, 2 * one * two
+
+    def raised(self, factor: Scalar, S: Triple) -> Components:
+        """A factor times a stress S_11, S_22, S_12 as components with indices up."""
+        (a1, a2), (b1, b2), (S1, S2, S6) = self.t1, self.t2, S
+        S11 = S1 * a1**2 + S2 * b1**2 + 2 * S6 * a1 * b1
+        S12 = S1 * a1 * a2 + S2 * b1 * b2 + S6 * (a1 * b2 + a2 * b1)
+        S22 = S1 * a2**2 + S2 * b2**2 + 2 * S6 * a2 * b2
+        return factor * S11, factor * S12, factor * S22
+
+
+def _stress(Q: Stiffness, e: Triple) -> Triple:
+    """S_11, S_22, S_12 of a strain e_11, e_22, 2 e_12."""
+    return (
+        Q[0] * e[0] + Q[1] * e[1] + Q[3] * e[2],
+        Q[1] * e[0] + Q[2] * e[1] + Q[4] * e[2],
+        Q[3] * e[0] + Q[4] * e[1] + Q[5] * e[2],
+    )
+
+
+def _work(S: Triple, e: Triple) -> Scalar:
+    return S[0] * e[0] + S[1] * e[1] + S[2] * e[2]

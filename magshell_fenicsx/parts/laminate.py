@@ -1,0 +1,196 @@
+"""Plies of a shell: their section, the stiffnesses of a laminate, the symmetry that it leaves, and its words.
+
+Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapters 2 and 4): each ply is in
+plane stress and orthotropic, and the layer at the height z above the middle has the strain E - z K.
+"""
+
+from math import isnan
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
+
+from magshell_fenicsx.input.section import Section, Sized, given, or_number
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.laminate import Laminate
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
+Positive = Annotated[float, Field(gt=0)]
+Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
+MERIDIAN = "meridian"
+FLAT = ("strip", "plate", "mesh")
+NONE = 1e-12  # of the largest stiffness: what is left where plies cancel
+KEPT = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])  # 11, 12, 22, 16, 26, 66
+TWISTING = [3, 4]  # of these
+
+
+class PlySection(Section):
+    """An orthotropic ply."""
+
+    _with_units: frozenset[bool] = PrivateAttr(default=frozenset())
+
+    angle: float = Field(default=0.0, ge=-360, le=360)
+    """From the direction `along` to the fibres, counterclockwise about the normal [degree]"""
+    E1: Modulus
+    """Young's modulus along the fibres, in the unit of youngs_modulus; without one over E [force/length²]"""
+    E2: Modulus
+    """Young's modulus across the fibres [force/length²]"""
+    nu12: float = Field(gt=-10, lt=10)
+    """Poisson's ratio: how it shrinks across the fibres when it is pulled along them; ν12² < E1/E2"""
+    G12: Modulus
+    """Shear modulus in the plane [force/length²]"""
+    fraction: float = Field(gt=0, le=1)
+    """Of the thickness; all add up to one [h]"""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _units(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        section = handler(data)
+        if isinstance(data, dict):
+            section._with_units = frozenset(isinstance(data[key], str) for key in ("E1", "E2", "G12"))
+        return section
+
+    @model_validator(mode="after")
+    def _positive(self) -> Self:
+        if self.nu12**2 * self.E2 >= self.E1:
+            raise ValueError(
+                f"nu12: {self.nu12:g}: allowed is nu12^2 < E1/E2 = {self.E1 / self.E2:.4g}: else a strain costs no "
+                "energy"
+            )
+        return self
+
+    @property
+    def stiffness(self) -> Array:
+        """Q (3, 3) with S = Q (E_11, E_22, 2 E_12) in the directions of `along` and across it."""
+        nu21 = self.nu12 * self.E2 / self.E1
+        own = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (1 - self.nu12 * nu21)
+        own[2, 2] = self.G12
+        c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
+        c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
+        strain = np.array([[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]])
+        return np.asarray(strain.T @ own @ strain)
+
+
+class LaminateSection(Section):
+    """Orthotropic plies in place of one isotropic material, in Koiter's law: membrane, bending, and both coupled.
+
+    youngs_modulus and poisson_ratio of the shell are then those of its units alone: energies over E h R², p/p_c, forces
+    over 2πD/R, moments over D/R.
+    """
+
+    along: Literal["meridian"] | Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    """Direction of the angle 0: away from the pole on the meridians of e3, or the part in the surface of a vector; by
+    default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
+    plies: list[PlySection] = Field(min_length=1, max_length=200)
+    """From the inner face outwards"""
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if abs(sum(ply.fraction for ply in self.plies) - 1) > 1e-6:
+            raise ValueError("plies: their fractions must add up to 1")
+        if len(frozenset[bool]().union(*(ply._with_units for ply in self.plies))) > 1:
+            raise ValueError("plies: give each of E1, E2, G12 a unit, or none of them")
+        if self.along is not None and self.along != MERIDIAN and not np.any(self.along):
+            raise ValueError("along: a vector of length zero is no direction")
+        return self
+
+    @property
+    def with_units(self) -> bool:
+        """Whether moduli are in pascals."""
+        return True in self.plies[0]._with_units
+
+    @property
+    def twists(self) -> bool:
+        """Whether a stretch or a bend along or across `along` shears or twists the shell."""
+        return bool(np.any(self.matrices(1.0)[:, TWISTING]))
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether all directions are alike."""
+        every = self.matrices(1.0)
+        off = np.stack([every[:, 0] - every[:, 2], (every[:, 0] - every[:, 1]) / 2 - every[:, 5]])
+        return not self.twists and bool(np.all(np.abs(off) <= NONE * np.abs(every).max()))
+
+    def matrices(self, E: float) -> Array:
+        """A, B and D (3, 6) over E h, E h² and E h³ as 11, 12, 22, 16, 26, 66; B of the strain E + z k."""
+        fractions = np.array([ply.fraction for ply in self.plies])
+        ends = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
+        Q = np.array([ply.stiffness[KEPT] for ply in self.plies]) / E
+        found = np.array([np.diff(ends**n) @ Q / n for n in (1, 2, 3)])
+        sizes = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
+        return np.where(np.abs(found) <= NONE * sizes, 0.0, found)
+
+    def direction(self, geometry: str) -> Array | None:
+        """The vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
+        if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
+            return None
+        return np.array([1.0, 0.0, 0.0] if self.along is None else self.along)
+
+    def refuse_unfit_units(self, shell: Sized) -> None:
+        """See that moduli and youngs_modulus are in one unit.
+
+        Raises
+        ------
+        ValueError
+            If one has a unit and the other has none.
+        """
+        if self.with_units == isnan(given(shell).E):
+            there = (
+                "have none: youngs_modulus has one" if not self.with_units else "have a unit: youngs_modulus has none"
+            )
+            raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
+
+
+def laminate_of(shell: Any, turn: float) -> "Laminate | None":
+    """That of a shell in a frame turned about e3 (rad); None without plies."""
+    from magshell_fenicsx.models.shell.laminate import Laminate  # the solver takes long to import
+
+    section: LaminateSection | None = shell.laminate
+    if section is None:
+        return None
+    direction = section.direction(shell.geometry)
+    turned = None if direction is None else rotation(turn) @ direction
+    return Laminate(section.matrices(shell.youngs_modulus or 1.0), turned)
+
+
+def laminate_leaves(shell: Any, outline: "Outline") -> list[Leaves]:
+    """The symmetry that the plies leave: all of isotropic ones, else that of the directions if nothing twists."""
+    section: LaminateSection | None = shell.laminate
+    if section is None or section.isotropic:
+        return []
+    vector = section.direction(shell.geometry)
+    unit = None if vector is None else vector / np.linalg.norm(vector)
+    reason = None
+    if section.twists:
+        reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"
+    elif unit is not None and np.hypot(*unit[:2]) > NONE:
+        reason = "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
+
+    def mirrors(mirror: Mirror) -> bool:
+        if section.twists:
+            return False
+        if unit is None:
+            return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
+        across = abs(float(unit @ mirror.normal))
+        return min(across, abs(across - 1)) <= NONE
+
+    beside = () if unit is None else tuple(float(np.arctan2(unit[1], unit[0])) + turn for turn in (0.0, np.pi / 2))
+    return [Leaves(reason, mirrors=mirrors, azimuths=() if section.twists else beside)]
+
+
+def laminate_account(section: LaminateSection, shell: Any) -> str:
+    """The words of `magshell check`."""
+    A, B, D = section.matrices(shell.youngs_modulus or 1.0)
+    angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + ("/..." if len(section.plies) > 12 else "")
+    vector = section.direction(shell.geometry)
+    along = "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
+    coupled = f"B up to {np.abs(B).max():.4g} E h^2 couples both" if B.any() else "not coupled"
+    return (
+        f"membrane and bending energy of a laminate [{angles}] with 0 along {along}: A11, A22 = {A[0]:.4g}, {A[2]:.4g} "
+        f"E h, D11, D22 = {D[0]:.4g}, {D[2]:.4g} E h^3, {coupled}"
+    )
