@@ -15,9 +15,11 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import Deviated, Embedding
 from magshell_fenicsx.mesh.shapes import DiscShape, flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 CASES = Path(__file__).parents[1] / "cases"
 CAP = """

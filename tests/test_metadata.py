@@ -60,7 +60,7 @@ def test_commands_of_the_recipe() -> None:
 
 def test_placeholders_are_where_it_is_said() -> None:
     """The page that lists them, and the files that have them."""
-    page = (TOP / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    page = (TOP / "docs/design.md").read_text(encoding="utf-8")
     (said,) = re.findall(r"`example\.org` stands for it in (.*?), and nowhere", page, re.DOTALL)
     listed = set(re.findall(r"`([^`]+)`", said))
     for name in listed:
@@ -68,7 +68,7 @@ def test_placeholders_are_where_it_is_said() -> None:
     git = subprocess.run(["git", "grep", "-l", "example.org"], cwd=TOP, capture_output=True, text=True)
     if git.returncode:
         pytest.skip("no repository of git")
-    assert set(git.stdout.split()) - {"CONTRIBUTING.md", "tests/test_metadata.py"} == listed
+    assert set(git.stdout.split()) - {"docs/design.md", "tests/test_metadata.py"} == listed
 
 
 @pytest.mark.parametrize("form", sorted((TOP / ".github/ISSUE_TEMPLATE").glob("*.yml")), ids=lambda form: form.stem)

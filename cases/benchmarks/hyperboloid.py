@@ -20,10 +20,10 @@ from magshell_fenicsx.mesh.grading import Grading, Line
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.problem.problem import meridian_vertices
 from magshell_fenicsx.public import Scene
+from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.follow import follow
 
 CASE = Path(__file__).parent / "hyperboloid.yaml"
@@ -40,7 +40,7 @@ linear regime. With clamped edges the membrane carries the load, with free edges
 the whole shell is of the order p²/(E h) and p²/(E h³). `python3 -m benchmarks.hyperboloid` writes this page.
 
 The **reference** is another discretisation: the second variation of waves cos 2θ on the meridian
-(`models/axisymmetric/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the
+(`shells/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the
 difference from half as many. **error** is the relative error of U on triangles (an eighth of the shell, degree 4),
 **order** that of the last two meshes in the size of the elements, where it is above the reference's error.
 

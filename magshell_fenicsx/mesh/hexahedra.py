@@ -12,6 +12,7 @@ from typing import Any
 import basix
 import basix.ufl
 import numpy as np
+import ufl
 from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
@@ -28,6 +29,7 @@ VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 SIDES = ((0, 1), (1, 2), (2, 0))  # of a triangle
 OUTER = ""  # face: a name that no edge has, while an annulus has an edge "outer"
 MIDDLE = 0.5  # of the thickness
+WHOLE = 5  # quadrature degree: three points in each direction
 
 
 @dataclass(frozen=True)
@@ -312,3 +314,12 @@ def _named_faces(domain: mesh.Mesh, quads: Quadrilaterals, levels: int) -> dict[
 def quadratic(domain: mesh.Mesh) -> fem.FunctionSpace:
     """Displacements of the mesh's own degree: rigid motions are exact."""
     return fem.functionspace(domain, ("Lagrange", 2, (3,)))
+
+
+def face_measure(domain: mesh.Mesh, parts: Sequence[NDArray[np.int32]]) -> ufl.Measure:
+    """Undeformed area of some facets, those of each part under its number from 1."""
+    facets = np.concatenate(parts)
+    tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
+    order = np.argsort(facets)
+    found = mesh.meshtags(domain, 2, facets[order], tags[order])
+    return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})

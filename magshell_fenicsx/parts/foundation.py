@@ -4,15 +4,14 @@ from collections.abc import Iterable
 from typing import Annotated, Self
 
 import ufl
-from pydantic import Field, field_validator, model_validator
-from ufl.constantvalue import Zero
+from pydantic import Field, model_validator
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.expressions import Formula, symbolic
+from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm, times_formula
+from magshell_fenicsx.models.shell.own_term import ByPlace, OwnTerm
 from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 
@@ -62,29 +61,17 @@ class Foundation(Part):
             raise ValueError("give stiffness, tangential, or both")
         return self
 
-    @field_validator("factor")
-    @classmethod
-    def _is_something(cls, text: str | None) -> str | None:
-        anywhere = [ufl.variable(ufl.as_ufl(number)) for number in (0.5, 0.25, 0.125)]
-        try:
-            found = symbolic(text, SYMBOLIC, *anywhere) if text else 1.0
-        except (ArithmeticError, ValueError):  # of numbers alone: no finite value, which the planner says with a place
-            return text
-        if isinstance(ufl.as_ufl(found), Zero):
-            raise ValueError(f"{text!r}: is zero everywhere: leave the foundation out")
-        return text
-
     def formulas(self, context: Context) -> Iterable[Formulas]:
         return [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)] if self.factor else []
 
     def terms(self, scales: Scales) -> list[OwnTerm]:
         k, springs = self._dimensionless(scales), list[OwnTerm]()
-        normal, reacting, tangential = (times_formula(self.factor, of) for of in (energy, reaction, tangential_energy))
+        factor = (ByPlace(self.factor, "foundation.factor"),) if self.factor else (1.0,)
         if "k" in k:
-            observed = {"foundation_force": reacting}
-            springs.append(OwnTerm("foundation", normal, (scales.force,), k["k"], observed))
+            observed = {"foundation_force": reaction}
+            springs.append(OwnTerm("foundation", energy, (scales.force, *factor), k["k"], observed))
         if "k_t" in k:
-            springs.append(OwnTerm("foundation_tangential", tangential, value=k["k_t"]))
+            springs.append(OwnTerm("foundation_tangential", tangential_energy, factor, k["k_t"]))
         return springs
 
     def account(self, scales: Scales) -> str:
@@ -96,16 +83,16 @@ class Foundation(Part):
         return {name: k * scales.R**2 / (scales.E * scales.h) for name, k in given.items() if k is not None}
 
 
-def energy(r0: Jet, u: Jet, force: Expr) -> Expr:
+def energy(r0: Jet, u: Jet, force: Expr, factor: Expr | float = 1.0) -> Expr:
     """The energy density for k = 1."""
-    return ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
+    return factor * ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
 
 
-def reaction(r0: Jet, u: Jet, force: Expr) -> Expr:
+def reaction(r0: Jet, u: Jet, force: Expr, factor: Expr | float = 1.0) -> Expr:
     """The density of the reaction for k = 1, over the unit of the force."""
-    return -ufl.dot(u.r, kin.normal(r0)) / force
+    return -factor * ufl.dot(u.r, kin.normal(r0)) / force
 
 
-def tangential_energy(r0: Jet, u: Jet) -> Expr:
+def tangential_energy(r0: Jet, u: Jet, factor: Expr | float = 1.0) -> Expr:
     """The energy density for k_t = 1."""
-    return (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2
+    return factor * (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

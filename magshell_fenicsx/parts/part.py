@@ -184,6 +184,8 @@ class Formulas:
     load
         Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
         elements of any size. Strains follow all else down to its last detail.
+    deformed
+        Whether it is of the deformed place, where nothing but the points of integration see it.
     """
 
     key: str
@@ -192,6 +194,7 @@ class Formulas:
     most: float
     length: float
     load: bool = False
+    deformed: bool = False
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,8 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
     "magnetism.source_step.SourcesSeen",
-    "magnetism.softness.SoftSeen",
-    "magnetism.own_field.SensorsSeen",
+    "magnetism.readings.SoftSeen",
+    "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
@@ -154,7 +154,7 @@ def _meaning(part: type[Part]) -> str:
 
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
     WithParts = WithOwnTerms
 else:  # an optional key for each part

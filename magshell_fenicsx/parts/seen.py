@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from magshell_fenicsx.continuation.system import State, Vector
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.observed import Observed
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.shells.observed import Observed
 
 Array = NDArray[np.float64]
 

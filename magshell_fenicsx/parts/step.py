@@ -34,7 +34,7 @@ from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.motion.step import TimeSection
     from magshell_fenicsx.shape.outline import Outline
 

@@ -4,8 +4,8 @@ from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
-from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
 from magshell_fenicsx.problem.problem import Body, body_of

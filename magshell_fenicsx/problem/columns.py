@@ -8,7 +8,7 @@ import numpy as np
 
 from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Problem

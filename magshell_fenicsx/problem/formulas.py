@@ -59,6 +59,8 @@ class Written:
     load
         Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
         elements of any size. Strains follow all else down to its last detail.
+    deformed
+        Whether it is of the deformed place, where nothing but the points of integration see it.
     """
 
     key: str
@@ -67,6 +69,7 @@ class Written:
     least: float
     most: float
     load: bool = False
+    deformed: bool = False
 
     def of_place(self, x: Array) -> Array:
         """Places (n, 3) -> each formula's values (n, formulas)."""
@@ -88,7 +91,7 @@ def _written(context: Context) -> Iterator[Written]:
         texts = tuple(value for value in each.values if isinstance(value, str))
         if texts:
             of_place = Together([formula(text) for text in texts], None, each.length)
-            yield Written(each.key, texts, of_place, each.least, each.most, each.load)
+            yield Written(each.key, texts, of_place, each.least, each.most, each.load, each.deformed)
 
 
 def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
@@ -328,8 +331,9 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
                 "seen"
             )
         wrong = _wrong_stiffness(values, cells, fit.nodal) if each.key == THICKNESS else 0.0
-        if fit.missed > TOTAL:
-            off = f"{100 * fit.missed:.2g} %"
+        lost = max(fit.missed, missed if each.deformed and missed > SQUARE else 0.0)
+        if lost > TOTAL:
+            off = f"{100 * lost:.2g} %"
             said.append(f"{each.key}: varies so much within elements that its integral may be wrong by {off}")
         elif wrong > STIFFNESS:
             said.append(

@@ -8,8 +8,9 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.kinematics import SECOND
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
+from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
 from magshell_fenicsx.parts.registered import SEEN, parts_of

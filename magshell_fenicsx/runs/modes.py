@@ -10,7 +10,6 @@ import numpy as np
 
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
 from magshell_fenicsx.output.fields.modes import (
     NAME,
@@ -30,6 +29,7 @@ from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.problem.wanted import FrequenciesSection, StabilitySection
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.touch import hardened, rigid, touching
 

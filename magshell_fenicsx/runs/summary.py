@@ -10,7 +10,6 @@ import scipy
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.models.modes import ShellMode
 from magshell_fenicsx.output.fields.modes import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import FILE
@@ -20,6 +19,7 @@ from magshell_fenicsx.platform.environment import code_version, fast_blas, versi
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.record import Record

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.revolution import nodal_normals
-from magshell_fenicsx.models.modes import ShellMode, ShellModes
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mirrored, Shape, on_meridian, on_surface
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.modes import ShellMode, ShellModes
+from magshell_fenicsx.shells.revolution import nodal_normals
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -24,10 +24,7 @@ from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0, rotation
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
@@ -42,6 +39,9 @@ from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.solid import SolidModel
 
 if TYPE_CHECKING:
     from magshell_fenicsx.simulate.record import Record

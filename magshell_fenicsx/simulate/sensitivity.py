@@ -25,15 +25,15 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivi
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
-from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Pattern, WithinRims
-from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import ground_of
+from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, plain

@@ -8,12 +8,12 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.parts.natural.shape import natural_field
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.scene import Scene
 
 FIELDS = {"magnetic": {"remanent"}, "shell": {"thickness_factor"}, "natural": {"curvature"}}

@@ -20,16 +20,16 @@ from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.parts.bodies.contact import Pressings
 from magshell_fenicsx.parts.course import SnapSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.parts.motion.mass import Ground, mass, whole_mass
 from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection
-from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.turning import vectors_of
+from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
+from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.shells.viscous import Branch, Viscosity
 from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -19,8 +19,8 @@ from magshell_fenicsx.continuation.control import GivenConjugate
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.public import run
+from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]

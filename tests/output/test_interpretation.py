@@ -13,11 +13,13 @@ from dolfinx import fem
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import SurfaceGatherer
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 UP = E3 = np.array([0.0, 0.0, 1.0])
 H = 0.05

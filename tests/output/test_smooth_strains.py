@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.point_fields import PointFields
 from magshell_fenicsx.output.fields.recovery import Recovery, smooth_parts, split
 from magshell_fenicsx.output.fields.surface import SurfaceGatherer
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from test_composition import NU, H, end
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.shells.modes import ShellModes
 
 MATERIAL = {"thickness": H, "poisson_ratio": NU, "youngs_modulus": 1.0}
 AROUND = dict.fromkeys(("left", "right", "bottom", "top"), "clamped")

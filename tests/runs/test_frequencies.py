@@ -14,7 +14,7 @@ from scipy.special import ive, jv
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 

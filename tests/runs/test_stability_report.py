@@ -14,11 +14,11 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.modes import mode_surface, wave_number
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.public import run
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
 # Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of Plates,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import Skewed, State
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.public import Scene
+from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 

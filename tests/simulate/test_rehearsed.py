@@ -15,10 +15,10 @@ from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.parts.motion.mass import mass
 from magshell_fenicsx.runs.rows import departures
 from magshell_fenicsx.runs.rows import rows as table_of
+from magshell_fenicsx.shells.mass import mass
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 

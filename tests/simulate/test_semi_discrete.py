@@ -11,7 +11,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.parts.motion.mass import mass
+from magshell_fenicsx.shells.mass import mass
 
 DRAG, END = 0.02, 6.0
 

@@ -8,8 +8,8 @@ from conftest import CASES
 from test_field_gradients import FIELDS, STRIP, Direction, by_difference, changed, directional, solved, state_with
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.public import Scene
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient

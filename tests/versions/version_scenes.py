@@ -15,10 +15,10 @@ from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.platform.environment import versions
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.public import Scene
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 

@@ -111,16 +111,11 @@ class _Site:
                 fill(here, values.renew()[0])
             factor = np.pi * factors[self._energies[number].amplitude]
             upper += factor * self._points.evaluate(self._kernels[number], self._batch.size)
-        hessians = upper[:, _triangle(size)]
-        entities, each = len(self._batch.cells[0]), len(self._batch.rule.weights)
-        shapes = self._shapes
-        right = (hessians @ shapes) * self._weights[:, None, None]
-        functions = shapes.shape[2]
-        left = shapes.reshape(entities, each * size, functions).transpose(0, 2, 1)
-        whole = (left @ right.reshape(entities, each * size, functions)).reshape(
-            entities, functions // WAVE, WAVE, functions // WAVE, WAVE
-        )
-        return np.asarray(whole.transpose(0, 1, 3, 2, 4))
+        entities, functions = len(self._batch.cells[0]), len(self._sides) * self._reference[0].shape[2]
+        ordered = (upper * self._scales).reshape(entities, -1)[:, self._order]
+        whole = ordered.reshape(-1, len(self._products)) @ self._products
+        whole = whole.reshape(entities, WAVE, WAVE, functions, functions)
+        return np.asarray(whole.transpose(0, 3, 4, 1, 2))
 
     @cached_property
     def _kernels(self) -> list[PointKernel]:
@@ -164,43 +159,53 @@ class _Site:
         """(points, sides, derivatives, components) of an axisymmetric field."""
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
         sides = [
-            np.einsum("edn,enc->edc", table, np.repeat(nodal[cells], len(self._batch.rule.weights), axis=0))
-            for table, cells in zip(self._tables, self._batch.cells, strict=True)
+            np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1) * scale[:, None, :, None]
+            for cells, table, scale in zip(self._batch.cells, self._reference, self._by_length, strict=True)
         ]
-        return np.stack(sides, axis=1)
+        return np.stack([each.reshape(-1, DERIVATIVES, PLANE) for each in sides], axis=1)
 
     @cached_property
-    def _tables(self) -> list[Array]:
-        """(points, derivatives, functions) by the coordinate of the meridian, on each side."""
-        V = self._u.function_space
-        found = []
-        for X, cells in zip(self._batch.rule.points, self._batch.cells, strict=True):
-            reference = V.element.basix_element.tabulate(2, X)[..., 0].transpose(1, 0, 2)
-            scales = 1 / _lengths(V)[cells][:, None] ** np.arange(DERIVATIVES)
-            whole = scales[:, None, :, None] * reference
-            found.append(whole.reshape(-1, DERIVATIVES, reference.shape[2]))
-        return found
+    def _reference(self) -> list[Array]:
+        """(points of an entity, derivatives, functions) in the reference cell, on each side."""
+        element = self._u.function_space.element.basix_element
+        return [element.tabulate(2, X)[..., 0].transpose(1, 0, 2) for X in self._batch.rule.points]
 
     @cached_property
-    def _shapes(self) -> Array:
-        """(points, numbers of the waves' jets, functions of all sides and components)."""
-        blocks = [np.einsum("pdn,ce->pdcne", table, np.eye(WAVE)) for table in self._tables]
-        points, derivatives, _, functions, _ = blocks[0].shape
-        size, width = derivatives * WAVE, functions * WAVE
-        whole = np.zeros((points, len(blocks) * size, len(blocks) * width))
-        for side, block in enumerate(blocks):
-            rows, columns = slice(side * size, (side + 1) * size), slice(side * width, (side + 1) * width)
-            whole[:, rows, columns] = block.reshape(points, size, width)
-        return whole
+    def _by_length(self) -> list[Array]:
+        """(entities, derivatives) what makes derivatives by the coordinate of the meridian of these, on each side."""
+        lengths = _lengths(self._u.function_space)
+        return [1 / lengths[cells][:, None] ** np.arange(DERIVATIVES) for cells in self._batch.cells]
 
     @cached_property
-    def _weights(self) -> Array:
-        """(points,) of the integral over the coordinate; one at a vertex."""
-        cells, weights = self._batch.cells[0], self._batch.rule.weights
-        density = self._energies[0].density
+    def _products(self) -> Array:
+        """(points of an entity and pairs of derivatives, pairs of functions), with the functions of all sides."""
+        each, derivatives, functions = self._reference[0].shape
+        count = len(self._sides)
+        of_sides = np.zeros((each, count, derivatives, count, functions))
+        for side, table in enumerate(self._reference):
+            of_sides[:, side, :, side] = table
+        jets = of_sides.reshape(each, count * derivatives, count * functions)
+        return np.asarray(np.einsum("qin,qjm->qijnm", jets, jets).reshape(each * jets.shape[1] ** 2, -1))
+
+    @cached_property
+    def _order(self) -> Ints:
+        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of its Hessians."""
+        derivatives = DERIVATIVES * len(self._sides)
+        triangle = _triangle(WAVE * derivatives).reshape(derivatives, WAVE, derivatives, WAVE)
+        points = np.arange(len(self._batch.rule.weights)) * (triangle.max() + 1)
+        places = triangle.transpose(1, 3, 0, 2)[:, :, None] + points[:, None, None]
+        return np.asarray(places.reshape(WAVE**2, -1))
+
+    @cached_property
+    def _scales(self) -> Array:
+        """(points, entries of the Hessians) the weights of the integral, one at a vertex, and the lengths of cells."""
+        cells, weights, density = self._batch.cells[0], self._batch.rule.weights, self._energies[0].density
         lengths = np.abs(_lengths(self._u.function_space)[cells])
         sizes = np.ones(len(cells)) if density and density.on_edges else lengths
-        return np.asarray(np.outer(sizes, weights).ravel())
+        of_jets = np.repeat(np.hstack(self._by_length), WAVE, axis=1)
+        rows, columns = np.triu_indices(of_jets.shape[1])
+        by_length = np.repeat(of_jets[:, rows] * of_jets[:, columns], len(weights), axis=0)
+        return np.asarray(np.outer(sizes, weights).reshape(-1, 1) * by_length)
 
 
 def _added(

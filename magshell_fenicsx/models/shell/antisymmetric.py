@@ -18,9 +18,8 @@ from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law
-from magshell_fenicsx.parts.natural.shape import Forms
 
 
 def antisymmetric_edge(

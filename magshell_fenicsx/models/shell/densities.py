@@ -7,14 +7,16 @@ of order one. An energy is the integral of density times area_ratio(r0).
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law, work
-from magshell_fenicsx.parts.magnetism.applied import around
-from magshell_fenicsx.parts.natural.shape import Forms
+
+PAIRS = np.triu_indices(3)
+SIZE = 3 + 3 + 3 + 9 + 18  # of a field's polynomial: u*, B at r0, B*, G*, H* by pairs j <= k
 
 MagneticDensity = Callable[..., Expr]  # of (r0, u, Br, Ba), and the natural forms where these are known
 
@@ -156,3 +158,16 @@ def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
 def following(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
     """v . n da: the virtual work of p = 1 in that unit; per area of the coordinates."""
     return unit * ufl.dot(v.r, kin.area_vector(r0 + u))
+
+
+def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:
+    """B at the displacement u from the polynomial P (`SIZE`,), and less what it is at u = 0."""
+    d = u - ufl.as_vector([P[i] for i in range(3)])
+
+    def component(i: int) -> Expr:
+        linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
+        pairs = enumerate(zip(*PAIRS, strict=True))
+        return P[6 + i] + linear + sum(P[18 + 6 * i + n] * d[int(j)] * d[int(k)] for n, (j, k) in pairs)
+
+    B = ufl.as_vector([component(i) for i in range(3)])
+    return B, B - ufl.as_vector([P[3 + i] for i in range(3)])

@@ -20,9 +20,8 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.batches import interior_batches
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law
-from magshell_fenicsx.parts.natural.shape import Forms
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]

@@ -18,7 +18,7 @@ from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
-from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
+from magshell_fenicsx.models.shell.own_term import ByPlace, Free, OwnTerm
 from magshell_fenicsx.platform import compat
 
 Parameter: TypeAlias = fem.Constant | fem.Function
@@ -184,7 +184,7 @@ def constants_of(term: OwnTerm, domain: mesh.Mesh, known: Constants) -> tuple[fe
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
-    def made(p: float | NDArray[np.float64] | Free | GivenField | Coefficient) -> fem.Constant | fem.Function:
+    def made(p: float | NDArray[np.float64] | Free | GivenField | ByPlace | Coefficient) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
             return known.setdefault(p.name, constant(p.value))
         if isinstance(p, Coefficient) and p.ufl_function_space().ufl_domain() == domain.ufl_domain():
@@ -194,6 +194,7 @@ def constants_of(term: OwnTerm, domain: mesh.Mesh, known: Constants) -> tuple[fe
                 f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on this mesh, "
                 "see ms.Shell"
             )
+        assert not isinstance(p, ByPlace)  # a model has made a function of it
         return constant(p)
 
     return tuple(made(p) for p in term.parameters)

@@ -208,3 +208,38 @@ class Edge:
 def angle_from(sine: Expr, cosine: Expr, past: Expr) -> Expr:
     """The angle with that sine and cosine, counted from the turn whose cosine and sine are `past` (2,)."""
     return ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
+
+
+@dataclass(frozen=True)
+class Forms:
+    """The natural shape at a point as surface tensors in coordinates, (2, 2) each.
+
+    Attributes
+    ----------
+    strain
+        (a_n - a0)/2.
+    bend
+        b_n - b0.
+    metric, up
+        a_n and its inverse.
+    area
+        Natural over undeformed area.
+    thickness
+        h_n over h.
+    """
+
+    strain: Expr
+    bend: Expr
+    metric: Expr
+    up: Expr
+    area: Expr
+    thickness: Expr
+
+    def kink(self, nu1: Expr, nu2: Expr) -> Expr:
+        """Natural over undeformed b_nunu where the curvature is across an edge with that conormal."""
+        return self.along(nu1, nu2) / self.thickness
+
+    def along(self, nu1: Expr, nu2: Expr) -> Expr:
+        """The natural length, squared, of a vector with these components."""
+        nu = ufl.as_vector([nu1, nu2])
+        return ufl.dot(nu, ufl.dot(self.metric, nu))

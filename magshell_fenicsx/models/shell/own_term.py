@@ -20,11 +20,12 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
-from magshell_fenicsx.input.expressions import symbolic
+from magshell_fenicsx.input.expressions import function
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry import Leaves, alike
+from magshell_fenicsx.shape.turning import scalar_turns
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -50,6 +51,38 @@ class Free:
 
 
 @dataclass(frozen=True)
+class ByPlace:
+    """A parameter that is a formula of x, y, z over R at the undeformed place: a number that varies over the surface.
+
+    Each cell has the polynomial with the moments of the formula: what is narrower than a cell is not missed.
+
+    Attributes
+    ----------
+    text
+        The formula.
+    key
+        That of the case file, for messages.
+    """
+
+    text: str
+    key: str
+
+    @property
+    def of_place(self) -> "Callable[[Array, Array, Array], Array]":
+        """The formula as a function of arrays."""
+        return function(self.text)
+
+    def turns(self, outline: "Outline") -> bool:
+        """Whether it is the same all around e3."""
+        return outline.span is not None and scalar_turns(self.text, outline.span)
+
+    def mirrored(self, mirror: Mirror, outline: "Outline") -> bool:
+        """Whether a plane mirrors it."""
+        x = outline.sample()
+        return alike(self.of_place(*x.T), self.of_place(*mirror.image(x).T))
+
+
+@dataclass(frozen=True)
 class OwnTerm:
     """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface or, with `on`, along an edge.
 
@@ -67,7 +100,8 @@ class OwnTerm:
         the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
     parameters
         Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can. A
-        dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place.
+        dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place;
+        a formula of the place (`ByPlace`) is a number.
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
@@ -88,7 +122,7 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr]
-    parameters: tuple[float | Array | Free | GivenField | Coefficient, ...] = ()
+    parameters: tuple[float | Array | Free | GivenField | ByPlace | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
@@ -142,12 +176,22 @@ class OwnTerm:
         """Whether a parameter is a function of the place."""
         return any(isinstance(p, GivenField | Coefficient) for p in self.parameters)
 
-    def with_functions(self, function: Callable[[GivenField], Coefficient]) -> "OwnTerm":
-        """With functions on the mesh of a model in place of fields that were given; of numbers (size,)."""
-        if not self.varying:
-            return self
-        parameters = tuple(function(p) if isinstance(p, GivenField) else p for p in self.parameters)
-        return replace(self, parameters=parameters)
+    @property
+    def by_place(self) -> tuple[ByPlace, ...]:
+        """Its parameters that are formulas of the place."""
+        return tuple(p for p in self.parameters if isinstance(p, ByPlace))
+
+    def with_functions(
+        self, made: Callable[[ByPlace], Coefficient], carried: Callable[[GivenField], Coefficient] | None = None
+    ) -> "OwnTerm":
+        """With functions of numbers (size,) on a model's mesh in place of formulas and of fields that were given."""
+
+        def function_of(p: Any) -> Any:
+            if isinstance(p, ByPlace):
+                return made(p)
+            return carried(p) if carried and isinstance(p, GivenField) else p
+
+        return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density that takes a function of one number as a vector of one."""
@@ -200,11 +244,15 @@ class OwnTerm:
         The frame of a half of what is round is turned to its plane: a term that does not turn stays behind.
         """
 
+        turns = self.turns and all(p.turns(outline) for p in self.by_place)
+
         def mirrors(mirror: Mirror) -> bool:
             turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
-            return self.mirrored(Y0 if turned else mirror) and (not turned or self.turns)
+            if turned and not turns:
+                return False
+            return self.mirrored(Y0 if turned else mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
 
-        shared, name = self.mirrored(Y0) and self.turns, self.name + (" or what it observes" if self.observed else "")
+        shared, name = self.mirrored(Y0) and turns, self.name + (" or what it observes" if self.observed else "")
         return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
     @property
@@ -215,6 +263,7 @@ class OwnTerm:
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
         text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, GivenField))
+        text += "".join(f" {p.text}" for p in self.by_place)
         text += "" if self.on is None else f" on {self.on}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -283,13 +332,6 @@ class Symbolic(NamedTuple):
     m: Expr
 
 
-def times_formula(text: str | None, density: Callable[..., Expr]) -> Callable[..., Expr]:
-    """A density, multiplied by a formula at the undeformed place; itself without one."""
-    if text is None:
-        return density
-    return lambda r0, *others: symbolic(text, SYMBOLIC, *r0.r) * density(r0, *others)
-
-
 def _random_samples() -> list[Sample]:
     """Jets of r0 and u, and covectors, always the same."""
     # within a box about as large as a shell
@@ -302,7 +344,9 @@ def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array | Free | GivenField | Coefficient) -> Expr:
+def _as_expression(value: float | Array | Free | GivenField | ByPlace | Coefficient) -> Expr:
+    if isinstance(value, ByPlace):  # of any value
+        value = 1.0
     if isinstance(value, GivenField):
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])

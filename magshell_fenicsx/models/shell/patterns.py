@@ -16,6 +16,7 @@ from magshell_fenicsx.mesh.given import stored
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
+from magshell_fenicsx.models.shell.own_term import ByPlace
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # of a remanence's components
@@ -223,6 +224,11 @@ def pattern_field(
     field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
     around = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
     return field, None if fit.smooth else around * fit.size
+
+
+def field_of_place(r0: fem.Function, parameter: ByPlace) -> fem.Function:
+    """A formula in every cell, of shape (1,), see `pattern_field`; collective."""
+    return pattern_field(Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1)[0]
 
 
 def pattern_on_edge(

@@ -11,7 +11,7 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.parts.magnetism.applied import around
+from magshell_fenicsx.models.shell.densities import around
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.patch import Deviated
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.revolution import ENDS, Revolution
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, SurfaceGatherer, grown
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.revolution import ENDS, Revolution
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
 

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.revolution import Revolution
-from magshell_fenicsx.models.modes import TORSION
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import Gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import read_csv, table_text
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.modes import TORSION
+from magshell_fenicsx.shells.revolution import Revolution
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
 WAVES = "m = "

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.shape.solids import Solid
 

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.law import Law
-from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
 from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
 
 Array = NDArray[np.float64]

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
 from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shells.shell import ShellModel
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27

@@ -18,7 +18,7 @@ from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.path import StepOptions
     from magshell_fenicsx.continuation.system import State
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
 SHARP = 1e-9  # least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of gap
 EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
 from magshell_fenicsx.parts.course import Fit
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.shape.ground import Ground, located

@@ -27,7 +27,7 @@ from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -193,19 +193,26 @@ class DeadSection(PathStep):
         forces = [np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v]
         places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
-        x = outline.sample() if len(fixed) < len(self.loads) else np.zeros((0, 3))
+        potentials = [load.potential for load in self.loads if load.potential]
+        x = outline.sample() if potentials or len(fixed) < len(self.loads) else np.zeros((0, 3))
         patches = any(load.over not in (None, "all") for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)
-            return on_plane and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
+            image = mirror.image(x)
+            alike_there = (alike(of(*(R * x).T), of(*(R * image).T)) for of in map(function, potentials))
+            return (
+                on_plane
+                and all(alike_there)
+                and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
+            )
 
         why = "a patch is loaded" if patches else None
         if any(tilted(v) for v in vectors):
             why = "a load is not along e3, or off the axis"
-        if span and not all(load_turns(load, span, R) for load in self.loads if load.varies):
+        around = all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
+        if span and not (around and all(scalar_turns(text, span, R) for text in potentials)):
             why = why or "a load differs around e3"
-        potentials = [load.potential for load in self.loads if load.potential]
         energies = [potential(f"potential_{i}", text, np.eye(3), context.scales) for i, text in enumerate(potentials)]
         return [Leaves(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
 
@@ -231,6 +238,9 @@ class DeadSection(PathStep):
                 values = value if isinstance(value, list) else [value]
                 most = LARGEST * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
+            if load.potential:  # of the deformed place, of which the first is looked at
+                most = LARGEST * scales.E * scales.h
+                yield Formulas(f"{key}.loads.{i}.potential", [load.potential], -most, most, scales.R, deformed=True)
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.forces.dead_load import dead_load  # the solver takes long to import

@@ -19,18 +19,11 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
-from magshell_fenicsx.models.shell.parameters import (
-    AreaForce,
-    DeadLoad,
-    EdgeForce,
-    EdgeMoment,
-    Loads,
-    PointForce,
-    Potential,
-)
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
 from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field, pattern_on_edge
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.platform import compat
 

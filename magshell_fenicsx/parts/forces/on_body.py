@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, face_measure
 from magshell_fenicsx.models.shell.patterns import Pattern, cells_of_body, places_in_body, refuse_unbounded, shown
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.parts.forces.dead_load import Entries, Weighted, averaged, smooth, within
 from magshell_fenicsx.platform import compat
 

@@ -12,7 +12,7 @@ from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
 
 class ImperfectionStep(PathStep):

@@ -13,19 +13,17 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, derived
 from magshell_fenicsx.assembly.terms import FormTerm, Term
+from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
 
 Array = NDArray[np.float64]
 HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the places of a path
-PAIRS = np.triu_indices(3)
-SIZE = 3 + 3 + 3 + 9 + 18  # u*, B at r0, B*, G*, H* by pairs j <= k
 
 
 def crossing(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
@@ -47,19 +45,6 @@ def crossing(distance: Callable[[Array], Array], before: Array, after: Array) ->
         before, after = np.concatenate([before, middle]), np.concatenate([middle, after])
         low, high = np.concatenate([low, between]), np.concatenate([between, high])
     return None
-
-
-def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:
-    """B at the displacement u from the polynomial P (`SIZE`,), and less what it is at u = 0."""
-    d = u - ufl.as_vector([P[i] for i in range(3)])
-
-    def component(i: int) -> Expr:
-        linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
-        pairs = enumerate(zip(*PAIRS, strict=True))
-        return P[6 + i] + linear + sum(P[18 + 6 * i + n] * d[int(j)] * d[int(k)] for n, (j, k) in pairs)
-
-    B = ufl.as_vector([component(i) for i in range(3)])
-    return B, B - ufl.as_vector([P[3 + i] for i in range(3)])
 
 
 class AppliedField:

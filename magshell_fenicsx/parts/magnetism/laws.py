@@ -14,7 +14,7 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.densities import MagneticDensity
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import MagneticEnergy, RemanenceLaw
+from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, RemanenceLaw
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

@@ -11,7 +11,6 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import (
     ByControls,
     Components,
@@ -22,8 +21,10 @@ from magshell_fenicsx.models.shell.patterns import (
     radial,
     tangential,
 )
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.sensors import sensors, units
 from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values

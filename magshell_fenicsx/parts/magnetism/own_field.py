@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.models.shell.parameters import ACROSS, Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
-from magshell_fenicsx.parts.magnetism.sensors import Sensor
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.softness import parity
-from magshell_fenicsx.parts.seen import Seen, Sight, Slope
+from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
     pass
@@ -255,93 +254,6 @@ def own_field(sight: Sight) -> OwnField:
         known = vars(model)["own_field"] = (of, OwnField(sight))
     found: OwnField = known[1]
     return found
-
-
-class SensorsSeen(Seen):
-    """What sensors read."""
-
-    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
-        from scipy.spatial import cKDTree
-
-        if not loads.sensors or surface.nodes.shape[1] < 3:  # of a chart `sensors.depth` knows
-            return
-        corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
-        spread = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
-        near = cKDTree(np.einsum("mk,nki->nmi", spread, corners).reshape(-1, 3))
-        for each in loads.sensors:
-            if near.query(each.place)[0] < each.half:
-                raise CaseError(
-                    f"sensors.{each.name}.position: is in the shell, within half its thickness of it: place it outside"
-                )
-
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
-        return tuple(column for each in loads.sensors for column in each.columns)
-
-    def differentiable(self, loads: Loads) -> Sequence[str]:
-        return self.columns(loads, ())
-
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
-        if not sight.loads.sensors:
-            return {}
-        readings = self._readings(sight, state, sight.loads.sensors)
-        pairs = zip(sight.loads.sensors, readings, strict=True)
-        return {column: float(B) for each, row in pairs for column, B in zip(each.columns, row, strict=True)}
-
-    def summary(self, sight: Sight, state: State) -> dict[str, Any]:
-        of = magnetised(sight.loads)
-        if of is None or not sight.loads.sensors:
-            return {}
-        own, at = own_field(sight), sight.model.system.at(state)
-        found = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
-        size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
-        return {"magnetic_moment": {"value": (size * found).tolist(), "unit": "A m²" if of.metres else "|Br| R³/μ0"}}
-
-    def slope(self, sight: Sight, state: State, column: str) -> Slope | None:
-        found = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]
-        if not found:
-            return None
-        (sensor, i), own = found[0], own_field(sight)
-        e = sensor.own * rotation(sight.azimuth)[:, i]
-        system = sight.model.system
-        at, nodes = system.at(state), sight.model.r0.function_space.dofmap.list
-
-        def derived() -> tuple[Array, Array]:
-            into, part = own.slope(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
-            size = into.by_u.shape[2]
-            np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
-            return part, into.by_remanence
-
-        part, by_remanence = at.of(derived)
-        by_mu = dict[str, float]()
-        applied = sight.loads.magnetic
-        if applied and (sensor.total or applied.soft):
-            names = {"lambda_m", *ACROSS, *(name for each in applied.driven for name in each.names)}
-            for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
-                size = STEP * (abs(value) or 1.0)
-                moved = ((way, State(state.u, {**state.mu, name: value + way * size})) for way, _ in CENTRAL)
-                values = {way: self._readings(sight, there, [sensor])[0][i] for way, there in moved}
-                by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
-        value = float(self._readings(sight, state, [sensor])[0][i])
-        return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
-
-    def _readings(self, sight: Sight, state: State, of: Sequence[Sensor]) -> list[Array]:
-        """(3,) of each, in the case's frame."""
-        Q = rotation(sight.azimuth)
-
-        def present() -> list[Array]:
-            if magnetised(sight.loads) is None:
-                return [np.zeros(3) for _ in of]
-            own = own_field(sight)
-            _, families = own.families(state.mu)
-            return [each.own * own.B(families, state.mu, each.place) for each in of]
-
-        found, applied = sight.model.system.at(state).of(present), sight.loads.magnetic
-        if applied:
-            found = [
-                B + each.applied * applied.at(state.mu, each.place[None])[0] if each.total else B
-                for each, B in zip(of, found, strict=True)
-            ]
-        return [B @ Q for B in found]
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:

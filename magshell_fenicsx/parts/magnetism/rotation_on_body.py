@@ -8,7 +8,7 @@ smooth at equal stretches too. In units and arguments as `densities`.
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.parts.magnetism.applied import around
+from magshell_fenicsx.models.shell.densities import around
 
 STEPS = 3  # from sqrt(3 I): rounding after three, for any stretches from 0.05 to 20
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.densities import around
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.parts.magnetism.applied import around
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Magnetisation
     from magshell_fenicsx.models.shell.patterns import Pattern
+    from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 
 Array = NDArray[np.float64]
 TERM = "soft magnetism"
@@ -81,7 +81,7 @@ class Sheet:
     @cached_property
     def amplitudes(self) -> tuple[str, ...]:
         """The amplitudes of the field's parts."""
-        from magshell_fenicsx.models.shell.parameters import ACROSS  # it needs this module
+        from magshell_fenicsx.parts.magnetism.magnetised import ACROSS  # it needs this module
 
         return ("lambda_m", *(() if self.field.in_space else ACROSS[: len(self.field.across)]))
 

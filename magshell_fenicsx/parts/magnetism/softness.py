@@ -1,6 +1,6 @@
 """The susceptibility of a case in the model's frame, and what a room sees of what a field induces."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import sqrt
 from typing import Any
 
@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import ByFormula, formula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
-from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims, by_patch
-from magshell_fenicsx.parts.magnetism.fields import INDUCED, MU_0, MagneticSection
+from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import alike
@@ -60,27 +59,3 @@ def parity(sight: Sight, field: Magnetisation, state: State, mirror: Mirror) -> 
     x = x[:: len(x) // PLACES + 1]
     images = field.at(state.mu, mirror.image(x)) @ mirror.reflection
     return float(np.sign(sight.model.system.comm.allreduce(float(np.sum(images * field.at(state.mu, x))))))
-
-
-class SoftSeen(Seen):
-    """The mean polarisation that the field induces."""
-
-    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
-        soft = loads.magnetic.soft if loads.magnetic else None
-        if soft and soft.patches:
-            by_patch(soft.patches, surface.patches, len(surface.cells), "magnetic.susceptibility")
-
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
-        return INDUCED if loads.magnetic and loads.magnetic.soft else ()
-
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
-        field = sight.loads.magnetic
-        if field is None or field.soft is None:
-            return {}
-        at, forms = sight.model.system.at(state), sight.model.observed
-        J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(forms["induced volume"])
-        if 1 not in sight.model.axes:  # of a meridian, with which they turn
-            J[:2] = 0.0
-        if sight.mirror:
-            J = (J + parity(sight, field, state, sight.mirror) * sight.mirror.reflection @ J) / 2
-        return dict(zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True))

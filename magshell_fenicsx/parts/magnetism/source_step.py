@@ -21,7 +21,7 @@ from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
 
 
 class SpinSection(Section):

@@ -18,7 +18,7 @@ from magshell_fenicsx.shape.symmetry import Leaves, alike
 from magshell_fenicsx.shape.turning import vector_turns, vectors_of
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]

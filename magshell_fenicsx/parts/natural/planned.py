@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.expressions import ByFormula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
-from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.part import Account, Context

@@ -18,7 +18,7 @@ from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import PatchMesh
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 _PER_LENGTH = re.compile(

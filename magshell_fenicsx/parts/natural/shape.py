@@ -18,7 +18,7 @@ whose metric G^T G is that of the shell's natural forms, linear in z.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import ufl
@@ -32,11 +32,8 @@ from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch, cells_of_body, places_in_body
-
-if TYPE_CHECKING:
-    from magshell_fenicsx.models.solid import terms as solid
 
 Array = NDArray[np.float64]
 Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | GivenField
@@ -189,41 +186,6 @@ def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
 
 
 @dataclass(frozen=True)
-class Forms:
-    """The natural shape at a point as surface tensors in coordinates, (2, 2) each.
-
-    Attributes
-    ----------
-    strain
-        (a_n - a0)/2.
-    bend
-        b_n - b0.
-    metric, up
-        a_n and its inverse.
-    area
-        Natural over undeformed area.
-    thickness
-        h_n over h.
-    """
-
-    strain: Expr
-    bend: Expr
-    metric: Expr
-    up: Expr
-    area: Expr
-    thickness: Expr
-
-    def kink(self, nu1: Expr, nu2: Expr) -> Expr:
-        """Natural over undeformed b_nunu where the curvature is across an edge with that conormal."""
-        return self.along(nu1, nu2) / self.thickness
-
-    def along(self, nu1: Expr, nu2: Expr) -> Expr:
-        """The natural length, squared, of a vector with these components."""
-        nu = ufl.as_vector([nu1, nu2])
-        return ufl.dot(nu, ufl.dot(self.metric, nu))
-
-
-@dataclass(frozen=True)
 class Shape:
     """A natural shape in the densities of a model: its field, see `natural_field`, and its amplitudes; None for 0."""
 
@@ -342,17 +304,8 @@ def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[st
     return Shape.of(field, natural, free)
 
 
-def grown_in_body(density: "solid.Density", shape: Shape) -> "solid.Density":
-    """A density that takes a `growth`, of that shape."""
-
-    def of(*arguments: Expr) -> Expr:
-        count = len(arguments) - len(shape.parameters)
-        return density.of(*arguments[:count], growth=_growth_in_body(shape, *arguments[count:]))
-
-    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
-
-
-def _growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
+def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
+    """What grows there, a tensor in space, where the field and the amplitudes have these values."""
     given = list(amplitudes)
     bent, stretched = (given.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch))
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.assembly.moving import Body, Curve, Lid, Moving, Pressed, ends
-from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.loads import Loads
 
 PRESSURE = "pressure"  # its amplitude
 

@@ -13,8 +13,8 @@ from magshell_fenicsx.quantities.quantity import MOMENT, REACTION, TURN, WAY, Qu
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
-    from magshell_fenicsx.models.observed import Observed
-    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.shells.observed import Observed
 
 Array = NDArray[np.float64]
 

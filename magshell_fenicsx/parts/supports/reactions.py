@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.moving import in_space
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.observed import Observed
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shells.observed import Observed
 
 Array = NDArray[np.float64]
 
@@ -36,7 +39,7 @@ class Reaction:
         return Reaction(S @ self.force, -S @ self.moment, point)
 
 
-def reactions(model: Observed, state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
+def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """The reactions of all supports in the model's frame; collective.
 
     A node of two supports belongs to the first. A clamped edge also makes a couple: its energy is invariant if shell
@@ -69,7 +72,7 @@ def reactions(model: Observed, state: State, mirror: Mirror | None = None) -> di
     return _of_whole(found, mirror) if mirror else found
 
 
-def weights(model: Observed, name: str, way: Array, mirror: Mirror | None = None) -> Array:
+def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
     """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a way (3,).
 
     As in `reactions`, of the whole shell, and a node of two supports belongs to the first.

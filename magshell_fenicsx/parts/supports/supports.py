@@ -18,7 +18,8 @@ from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
+from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.supports.moved import Support
 
 Array = NDArray[np.float64]

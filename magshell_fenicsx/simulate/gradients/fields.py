@@ -23,14 +23,14 @@ from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import Deviated
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import Uniform
 from magshell_fenicsx.models.shell.residual import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms

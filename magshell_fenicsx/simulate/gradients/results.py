@@ -10,7 +10,8 @@ import numpy as np
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.shell.parameters import ACROSS, EdgeMoment, Potential
+from magshell_fenicsx.models.shell.parameters import EdgeMoment, Potential
+from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History

@@ -24,8 +24,8 @@ from magshell_fenicsx.assembly.evaluated import CENTRAL
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
     WAVE,

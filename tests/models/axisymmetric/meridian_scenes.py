@@ -11,9 +11,11 @@ from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Instability, instabilities
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Force, Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.meridian import MeridianModel
 
 E3 = np.array([0.0, 0.0, 1.0])
 ALONG_AXIS = Magnetisation(E3, E3)

@@ -5,12 +5,14 @@ import pytest
 from conftest import hemisphere as triangulated
 from meridian_scenes import E3, hemisphere
 
-from magshell_fenicsx.models.axisymmetric.revolution import Revolution
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.revolution import Revolution
+from magshell_fenicsx.shells.shell import ShellModel
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)

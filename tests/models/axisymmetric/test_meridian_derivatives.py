@@ -9,10 +9,12 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Material
 from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.meridian import MeridianModel
 
 TERMS = ["membrane", "bending", "interior edges", "clamped edges", "magnetic", "pressure"]
 RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "load moment b 0"]

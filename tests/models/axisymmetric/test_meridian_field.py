@@ -10,8 +10,9 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 
 
 def dense(K: PETSc.Mat) -> np.ndarray:

@@ -14,9 +14,10 @@ from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.mesh.shapes import flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.parameters import Force, Loads, Material
+from magshell_fenicsx.models.shell.parameters import Force, Material
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.problem.problem import meridian_vertices
+from magshell_fenicsx.shells.meridian import MeridianModel
 
 
 @pytest.mark.parametrize(

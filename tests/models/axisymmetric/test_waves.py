@@ -10,10 +10,12 @@ from meridian_scenes import E3, Buckling, buckle, dimpled, hemisphere
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Crossing, Watch
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import radial
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
 
 Array = np.ndarray
 FIELD = Magnetisation(radial, E3, gradient=np.diag([0.5, 0.5, -1.0]))

@@ -8,9 +8,10 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 
 

@@ -13,9 +13,11 @@ from test_fast_residual import difference as residual_difference
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
+from magshell_fenicsx.shells.shell import ShellModel
 
 MATERIAL, MU, LAWS = Material(0.3, 0.05), {"lambda_m": 0.4}, ["deformation", "rotation"]
 BR, BA = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96])

@@ -14,10 +14,12 @@ from test_fast_tangent import HALF_SHELL, pattern
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.models.shell import gradients
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Force, Material
 from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 Shells = Callable[..., ShellModel]
 DEGREES, HIGH = [2, 3], [2, pytest.param(5, marks=pytest.mark.slow)]

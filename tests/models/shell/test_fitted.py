@@ -2,6 +2,7 @@
 
 import re
 from itertools import pairwise
+from math import pi
 
 import numpy as np
 import pytest
@@ -68,6 +69,27 @@ def test_all_of_a_narrow_load_is_carried(load, of, radius, mesh):
     end = list(follow(scene))[-1]
     force = scene.observe(end.point.state)["rim_fz"]
     assert force == pytest.approx(1e-7 * over_sphere(of, radius), rel=1e-3)
+
+
+@pytest.mark.parametrize("width", [0.02, 0.002])
+def test_all_of_a_narrow_potential_is_there(width: float) -> None:
+    """Of a rigid lift its energy is that of the force on a disc: pi width². Its place is found by no symmetry."""
+    case = {
+        "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+        "boundary": {"rim": "clamped"},
+        "loading": {
+            "kind": "dead",
+            "control": "load",
+            "loads": [{"over": "all", "potential": f"1e-7*exp(-((x-0.31)**2+(y-0.17)**2)/{width}**2)*(1+z)"}],
+            "factor": 1,
+            "points": 1,
+        },
+    }
+    system = Scene(Case.model_validate(case)).model.system
+    lift = np.tile([0.0, 0.0, 1e-6], system.size // 3)
+    assert system.potential(lift, {}, "load") == pytest.approx(50 * 1e-13 * pi * width**2, rel=1e-4)
+    coarse = describe(Case.model_validate(case | {"mesh": {"size": 0.2}}))
+    assert "potential: varies so much within elements that its integral may be wrong by" in coarse
 
 
 def test_moments_of_a_step_on_coarse_cells_and_a_polynomial_that_stays():

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from conftest import hemisphere
 
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 Shells = Callable[..., ShellModel]
 

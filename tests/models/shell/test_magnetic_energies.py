@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from conftest import hemisphere
 
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 UP, TILTED = np.array([0.0, 0, 1]), np.array([0.48, 0.36, 0.8])
 ENERGIES: tuple[MagneticEnergy, ...] = get_args(MagneticEnergy)

@@ -18,9 +18,10 @@ from magshell_fenicsx.mesh.msh import in_space
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.revolved import Arc, Revolved, Segment
 from magshell_fenicsx.mesh.shapes import flat
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Held, Loads, Material, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Held, Material, PointForce
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.shell import ShellModel
 
 MATERIAL = Material(0.3, 0.05)
 MOMENT = Loads(dead={"load": (EdgeMoment("right", 0.01),)})

@@ -14,10 +14,9 @@ from scipy.integrate import solve_bvp
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import Skewed, Tangent
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.mesh.hexahedra import OUTER
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.models.solid.terms import face_measure
+from magshell_fenicsx.mesh.hexahedra import OUTER, face_measure
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
 CYLINDER = {"geometry": "cylinder", "radius": 1.0, "length": 1.0, "thickness": 0.1, "poisson_ratio": 0.3}

@@ -19,8 +19,9 @@ from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.law import Koiter
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
+from magshell_fenicsx.models.shell.parameters import AreaForce, Material
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 
 E1, E2, E3 = np.eye(3)

@@ -5,12 +5,14 @@ import pytest
 from conftest import hemisphere
 
 from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import Layer, layer_average
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.shell import ShellModel
 
 UP = np.array([0.0, 0, 1])
 SIZE = 0.02

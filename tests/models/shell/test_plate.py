@@ -11,8 +11,9 @@ from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.shell import ShellModel
 
 MATERIAL = Material(0.3, 0.02)
 

@@ -14,12 +14,14 @@ from test_fast_residual import difference as residual_difference
 from test_magnetic_energies import order, smooth
 
 from magshell_fenicsx.mesh.mirror import Y0
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Loads, MagneticEnergy, Magnetisation, Material, RemanenceLaw
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism import laws
+from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Magnetisation, RemanenceLaw
+from magshell_fenicsx.shells.shell import ShellModel
 
 MATERIAL = Material(0.3, 0.05)
 BR, BA, E3 = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8]), np.array([0.0, 0.0, 1.0])

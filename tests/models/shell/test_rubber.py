@@ -9,13 +9,15 @@ from along import check, difference
 from conftest import disc, hemisphere, random_displacement
 
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import Condition, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.rubber import Rubber
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import Natural, meridians
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
 
 SHARES, H = [0.0, 0.3, 1.0], 0.1
 RNG = np.random.default_rng(7)

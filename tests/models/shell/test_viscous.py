@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.parts.motion.mass import mass
-from magshell_fenicsx.parts.motion.viscous import Viscosity
 from magshell_fenicsx.runs.rows import columns
+from magshell_fenicsx.shells.mass import mass
+from magshell_fenicsx.shells.viscous import Viscosity
 
 OMEGA = 3.5160 * np.sqrt(1 / 12) / 50  # of a cantilever, R/h = 50, nu = 0
 

@@ -8,10 +8,11 @@ from bodies import plate
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.models.solid.terms import WHOLE, SolidTerm, TermFactory
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.solid import SolidModel
+from magshell_fenicsx.shells.solid_terms import WHOLE, SolidTerm, TermFactory
 
 H = 0.05
 

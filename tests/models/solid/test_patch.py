@@ -9,9 +9,10 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.shapes import StripShape, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.solid import SolidModel
 
 
 def test_uniform_deformation() -> None:

@@ -11,10 +11,10 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
+from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.shells.solid import SolidModel
 
 BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentation.yaml"
 

@@ -9,13 +9,14 @@ from bodies import body_of, hemisphere
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.mesh.hexahedra import OUTER
-from magshell_fenicsx.models.shell.parameters import EdgeMoment, Loads, Magnetisation, Material
+from magshell_fenicsx.mesh.hexahedra import OUTER, face_measure
+from magshell_fenicsx.models.shell.parameters import EdgeMoment, Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.solid import SolidModel
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}

@@ -11,10 +11,12 @@ from test_solid_derivatives import FIELD, MU, displacement
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
-from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
+from magshell_fenicsx.shells.solid import SolidModel
 
 H = 0.1
 G = FIELD.gradient

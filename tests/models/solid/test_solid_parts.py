@@ -15,17 +15,11 @@ from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.parameters import (
-    AreaForce,
-    EdgeForce,
-    EdgeMoment,
-    Loads,
-    Magnetisation,
-    Material,
-    PointForce,
-)
+from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Material, PointForce
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.shells.solid import SolidModel
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 from magshell_fenicsx.simulate.transfer import transfer
 

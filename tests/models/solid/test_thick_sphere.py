@@ -10,10 +10,11 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.models.solid.terms import TermFactory
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.solid import SolidModel
+from magshell_fenicsx.shells.solid_terms import TermFactory
 
 THICKNESS = 0.4
 

@@ -7,17 +7,16 @@ from typing import Literal
 import basix
 import numpy as np
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import Counted, DensityTerm
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, WHOLE, Body, face_measure
 from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.models.shell.patterns import (
     Pattern,
     cells_of_body,
@@ -31,9 +30,10 @@ from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 
-WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
+REDUCED = 3  # quadrature degree: two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
@@ -212,10 +212,10 @@ class TermFactory:
 
     def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
         """A density of the volume, which depends on places alone."""
-        flat, count = [ufl.zero(3)] * len(CURVED), len(term.parameters)
+        flat, count, at_point = [ufl.zero(3)] * len(CURVED), len(term.parameters), term.at_point(of)
 
         def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
-            return of(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
+            return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
 
         constants = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(at, (*constants, *self._constants(self.h)), VALUE)
@@ -230,7 +230,7 @@ class TermFactory:
         flat = [ufl.zero(3)] * len(SECOND)
 
         def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
-            return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
+            return per_area(term.at_point(of))(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
@@ -314,15 +314,6 @@ class TermFactory:
 
     def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:
         return tuple(fem.Constant(self.body.mesh, value) for value in values)
-
-
-def face_measure(domain: mesh.Mesh, parts: Sequence[Facets]) -> ufl.Measure:
-    """Undeformed area of some facets, those of each part under its number from 1."""
-    facets = np.concatenate(parts)
-    tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
-    order = np.argsort(facets)
-    found = mesh.meshtags(domain, 2, facets[order], tags[order])
-    return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})
 
 
 def field_in_body(

@@ -22,7 +22,7 @@ from magshell_fenicsx.assembly.shape_tables import Table
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.mesh.hexahedra import Body
 from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
-from magshell_fenicsx.models.solid.terms import SolidTerm
+from magshell_fenicsx.shells.solid_terms import SolidTerm
 
 Array = NDArray[np.float64]
 PARTS = 4  # value and three reference derivatives

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.carriers import Carrier, HeldEdge
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.law import Koiter, work
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
 SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space

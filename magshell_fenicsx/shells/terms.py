@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import ACROSS, DeadLoad, EdgeMoment, Magnetisation, Material, Potential
+from magshell_fenicsx.models.shell.parameters import DeadLoad, EdgeMoment, Material, Potential
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 from magshell_fenicsx.parts.bodies.contact import (
@@ -40,6 +40,7 @@ from magshell_fenicsx.parts.bodies.contact import (
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
+from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 

@@ -19,8 +19,8 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.parts.motion.mass import Model, mass_matrix, of_displacements, of_waves, thickness
+from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, thickness
+from magshell_fenicsx.shells.meridian import MeridianModel
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see

@@ -7,8 +7,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.patterns import places
+from magshell_fenicsx.shells.meridian import MeridianModel
 
 Array = NDArray[np.float64]
 OFF_POLE = 1e-3  # of the first cell

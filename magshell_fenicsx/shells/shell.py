@@ -6,7 +6,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -23,23 +23,14 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.carriers import on_surface
-from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.gradients import PointTerm
-from magshell_fenicsx.models.shell.parameters import (
-    Condition,
-    Force,
-    Held,
-    Loads,
-    Material,
-    default_penalty,
-)
-from magshell_fenicsx.models.shell.patterns import carried, cells_of
+from magshell_fenicsx.models.shell.parameters import Condition, Force, Held, Material, default_penalty
+from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
-from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import (
     SurfaceMeasures,
@@ -48,6 +39,7 @@ from magshell_fenicsx.parts.forces.dead_load import (
     point_entries,
     vertex_normal,
 )
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import openings
@@ -60,6 +52,8 @@ from magshell_fenicsx.parts.supports.supports import (
     put_in_plane,
     refuse_unknown,
 )
+from magshell_fenicsx.shells.observed import Thin
+from magshell_fenicsx.shells.terms import EnergyFactory
 
 
 class ShellModel(Thin):
@@ -130,7 +124,10 @@ class ShellModel(Thin):
             if (field := getattr(loads, name)) and field.given:
                 vectors = carried(field.given, midsurface, in_cells)
                 loads = replace(loads, **{name: replace(field, remanent=vectors)})
-        loads = self.loads = replace(loads, own=tuple(term.with_functions(midsurface.function) for term in loads.own))
+        of_place = partial(field_of_place, self.r0)
+        loads = self.loads = replace(
+            loads, own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own)
+        )
         if thickness and thickness.given:
             thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
         self.sigma = default_penalty(degree) if sigma is None else sigma

@@ -18,12 +18,13 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.fitted import Cells
-from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.models.shell.terms import EnergyFactory
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.bodies.contact import Pressing, Region
 from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
+from magshell_fenicsx.shells.terms import EnergyFactory
 
 Array = NDArray[np.float64]
 

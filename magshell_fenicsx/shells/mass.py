@@ -17,11 +17,11 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.models import carriers
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.platform import compat
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.solid import SolidModel
 
 Model = ShellModel | MeridianModel | SolidModel
 

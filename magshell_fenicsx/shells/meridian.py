@@ -5,8 +5,8 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -20,19 +20,20 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.waves import ExcludedWaves, Waves
 from magshell_fenicsx.models.carriers import on_meridian
-from magshell_fenicsx.models.observed import Thin
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
-from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential, default_penalty
+from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import openings, supports
 from magshell_fenicsx.parts.supports.supports import held_on
+from magshell_fenicsx.shells.observed import Thin
+from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
+from magshell_fenicsx.shells.waves import ExcludedWaves, Waves
 
 Array = NDArray[np.float64]
 
@@ -128,11 +129,13 @@ class MeridianModel(Thin):
         sigma: float | None = None,
         thickness: Thickness | None = None,
     ) -> None:
-        self.meridian, self.material, self.degree, self.loads = meridian, material, degree, loads
+        self.meridian, self.material, self.degree = meridian, material, degree
         self.conditions = conditions
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
+        of_place = partial(field_of_place, self.r0)
+        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
         self.sigma = default_penalty(degree) if sigma is None else sigma
         shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None

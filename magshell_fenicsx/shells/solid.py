@@ -23,22 +23,25 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, quadratic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
-from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Magnetisation, Material, Potential
-from magshell_fenicsx.models.shell.patterns import ByPatch, cells_of_body, places_in_body
+from magshell_fenicsx.models.shell.own_term import ByPlace
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential
+from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
-from magshell_fenicsx.models.solid.sites import make_sites
-from magshell_fenicsx.models.solid.terms import Density, TermFactory
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
-from magshell_fenicsx.parts.natural.shape import body_shape, grown_in_body
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.natural.shape import Shape, body_shape, growth_in_body
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
+from magshell_fenicsx.shells.observed import Observed
+from magshell_fenicsx.shells.solid_sites import make_sites
+from magshell_fenicsx.shells.solid_terms import Density, TermFactory, field_in_body
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -87,13 +90,18 @@ class SolidModel(Observed):
     ) -> None:
         if loads.magnetic:
             loads = replace(loads, magnetic=_in_cells(loads.magnetic, body))
-        self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
+        self.body, self.material, self.neo_hookean = body, material, neo_hookean
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = quadratic(body.mesh)
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
+
+        def of_place(parameter: ByPlace) -> fem.Function:
+            return field_in_body(Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1)
+
+        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
         free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
         if loads.natural:
@@ -215,3 +223,13 @@ def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:
     ends = np.cumsum([fraction for fraction, _ in layers])
     middle = body.between.mean(axis=1)
     return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])
+
+
+def grown_in_body(density: Density, shape: Shape) -> Density:
+    """A density that takes a `growth`, of that shape."""
+
+    def of(*arguments: Expr) -> Expr:
+        count = len(arguments) - len(shape.parameters)
+        return density.of(*arguments[:count], growth=growth_in_body(shape, *arguments[count:]))
+
+    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))

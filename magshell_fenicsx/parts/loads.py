@@ -1,0 +1,51 @@
+"""All that loads a shell: what the parts of a problem add up to, dimensionless."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
+from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.magnetism.sensors import Sensor
+from magshell_fenicsx.parts.natural.shape import Natural
+
+
+@dataclass(frozen=True)
+class Loads:
+    """What loads the shell; what is empty, None or False has no term and no kernel.
+
+    Attributes
+    ----------
+    forces, dead
+        Amplitude -> the force, or the dead loads that grow together.
+    growing
+        Amplitude -> imperfections that grow.
+    remanence
+        What is magnetised where no field is applied: it loads nothing, and is drawn.
+    sensors
+        Where its magnetic field is read.
+    """
+
+    pressure: bool = False
+    forces: Mapping[str, Force] = field(default_factory=dict)
+    magnetic: Magnetisation | None = None
+    dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
+    own: tuple[OwnTerm, ...] = ()
+    natural: Natural | None = None
+    moves: tuple[Move, ...] = ()
+    contacts: tuple[Contact, ...] = ()
+    growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
+    remanence: Magnetisation | None = None
+    sensors: tuple[Sensor, ...] = ()
+
+    @property
+    def all_dead(self) -> tuple[DeadLoad, ...]:
+        """The dead loads of all amplitudes."""
+        return tuple(load for loads in self.dead.values() for load in loads)
+
+    @property
+    def displaced(self) -> str | None:
+        """The amplitude with the displacement that the column w_over_h has; None if that is the pole's."""
+        return next(iter((*self.forces, *self.dead)), None)
