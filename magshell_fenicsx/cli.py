@@ -291,6 +291,26 @@ def design(
 
 
 @app.command()
+def identify(
+    case: CaseFile,
+    data: Annotated[Path, typer.Option(metavar="FILE.csv", help="what was measured: columns with units")],
+    set_: Settings = None,
+    out: Annotated[str | None, folder_option("results/<case name>_identify/")] = None,
+) -> None:
+    """Find numbers of a case from measured data (its section `identify`), and how sure they are; keep evaluations."""
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.simulate.record import Stopped
+    from magshell_fenicsx.studies.identify import identify as identify_parameters
+
+    folder = chosen_folder(out, f"{case.stem}_identify")
+    with exit_codes(stopped=(DiskError, Stopped)):
+        done = identify_parameters(case, data, set_ or [], folder, made=_shared, say=print_line)
+    print_line(f"results in {folder}/")
+    if done.fit.ended != "converged":
+        raise failure(f"stopped early: {done.fit.ended}", STOPPED)
+
+
+@app.command()
 def compare(
     case: CaseFile,
     set_: Settings = None,

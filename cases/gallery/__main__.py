@@ -17,6 +17,7 @@ from magshell_fenicsx.output.store.table import read_rows
 OUT = CASES.parent / "docs" / "gallery"
 WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
 FIRST = (
+    "identify.png",
     "designed.png",
     "design.png",
     "boundary.png",
@@ -37,8 +38,10 @@ one core of a shared machine, kernels compiled. Made by `make gallery`.
 def row(file: Path) -> str:
     """Run a case; its part of the page."""
     data = read_source(file).data
-    kind = next((kind for kind in ("ensemble", "design") if kind in data), "run")
+    kind = next((kind for kind in ("ensemble", "design", "identify") if kind in data), "run")
     more = ["--samples", "20", "--seed", "1"] if kind == "ensemble" else []
+    if kind == "identify":
+        more = ["--data", f"cases/{file.stem}.csv"]
     if over := OVER.get(file.stem):
         kind, more = "boundary", ["--over", over]
     command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem

@@ -39,6 +39,7 @@ ELSEWHERE = (
     "gradients",
     "ensemble",
     "design",
+    "identify",
     "output",
 )
 

@@ -43,7 +43,7 @@ from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, ke
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
-ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "output")
+ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "identify", "output")
 STEPS, MOST_STEPS = 20, 1000
 ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 SPECIAL = ("cusp", "turn", "meeting")
