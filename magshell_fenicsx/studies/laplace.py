@@ -151,14 +151,11 @@ def fitted(
 
     Raises
     ------
-    ValueError
-        If there is no prediction at the start.
     NotSeen
         If data and priors leave a combination of parameters open.
     """
     first = model(start)
-    if first is None:
-        raise ValueError("nothing is predicted at the start")
+    assert first, "there is a prediction at the start"
     x, (y, J) = np.array(start), first
     noise, freedom = _estimated(known, y, J, _guessed(known, y), size)
     ended = f"{most} steps"
