@@ -172,7 +172,11 @@ def sweep(
 def boundary(
     case: CaseFile,
     over: Annotated[
-        str, typer.Option(metavar="KEY=A:B", help="the key that varies, and its range; A:B:STEPS is finer")
+        list[str],
+        typer.Option(
+            metavar="KEY=A:B",
+            help="the key that varies, and its range; A:B:STEPS is finer; a second one, KEY=A:B:COUNT, makes a map",
+        ),
     ],
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_boundary/")] = None,
@@ -181,10 +185,14 @@ def boundary(
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
     from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+    from magshell_fenicsx.studies.boundary_map import boundary_map
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = follow_boundary(case, over, set_ or [], folder, made=_made)
+        if len(over) == 1:
+            done = follow_boundary(case, over[0], set_ or [], folder, made=_made)
+        else:
+            done = boundary_map(case, over, set_ or [], folder, made=_made)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)

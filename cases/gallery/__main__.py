@@ -27,7 +27,10 @@ FIRST = (
     "gradients.png",
     "shell.png",
 )  # that there is
-OVER = {"arch_boundary": "loading.0.factor=0.5:1.9"}  # cases of magshell boundary -> the key that varies
+OVER = {  # cases of magshell boundary -> the keys that vary
+    "arch_boundary": ["loading.0.factor=0.5:1.9"],
+    "snap_map": ["shell.defect.amplitude=0.4:2:4", "magnetic.lambda_m=-0.004:0.004:5"],
+}
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
@@ -43,7 +46,7 @@ def row(file: Path) -> str:
     if kind == "identify":
         more = ["--data", f"cases/{file.stem}.csv"]
     if over := OVER.get(file.stem):
-        kind, more = "boundary", ["--over", over]
+        kind, more = "boundary", [word for each in over for word in ("--over", each)]
     command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
     before = os.times()
     said = subprocess.run(

@@ -35,7 +35,7 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import Varied, instability
+from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
@@ -184,6 +184,7 @@ def boundary(
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say))
         if not begin["label"]:
             instability([])
+        refuse_excluded(begin["mode"])
         once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
