@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.models.shell import kinematics
     from magshell_fenicsx.models.shell.kinematics import Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
-    from magshell_fenicsx.public import Scene, boundary, follow, run
+    from magshell_fenicsx.public import Scene, boundary, follow, identify, run
     from magshell_fenicsx.python import (
         Clamped,
         Field,
@@ -74,6 +74,7 @@ __all__ = [
     "fold_at",
     "follow",
     "gradient",
+    "identify",
     "kinematics",
     "off_screen",
     "picture",
@@ -91,7 +92,7 @@ _ROOMS = {
     "models.shell": "kinematics",
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",
-    "public": "Scene boundary follow run",
+    "public": "Scene boundary follow identify run",
     "python": "Clamped Field Force Held Hinged OnPlane Pressure Problem Section Shell Step",
     "runs.notebook": "curve off_screen picture polydata surface",
     "runs.rows": "Table columns",

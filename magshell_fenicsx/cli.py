@@ -172,7 +172,11 @@ def sweep(
 def boundary(
     case: CaseFile,
     over: Annotated[
-        str, typer.Option(metavar="KEY=A:B", help="the key that varies, and its range; A:B:STEPS is finer")
+        list[str],
+        typer.Option(
+            metavar="KEY=A:B",
+            help="the key that varies, and its range; A:B:STEPS is finer; a second one, KEY=A:B:COUNT, makes a map",
+        ),
     ],
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_boundary/")] = None,
@@ -181,10 +185,14 @@ def boundary(
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
     from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+    from magshell_fenicsx.studies.boundary_map import boundary_map
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = follow_boundary(case, over, set_ or [], folder, made=_made)
+        if len(over) == 1:
+            done = follow_boundary(case, over[0], set_ or [], folder, made=_made)
+        else:
+            done = boundary_map(case, over, set_ or [], folder, made=_made)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)
@@ -288,6 +296,26 @@ def design(
     with exit_codes(stopped=(DiskError, Missed)):
         run_design(case, set_ or [], folder, made=_shared, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
+
+
+@app.command()
+def identify(
+    case: CaseFile,
+    data: Annotated[Path, typer.Option(metavar="FILE.csv", help="what was measured: columns with units")],
+    set_: Settings = None,
+    out: Annotated[str | None, folder_option("results/<case name>_identify/")] = None,
+) -> None:
+    """Find numbers of a case from measured data (its section `identify`), and how sure they are; keep evaluations."""
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.simulate.record import Stopped
+    from magshell_fenicsx.studies.identify import identify as identify_parameters
+
+    folder = chosen_folder(out, f"{case.stem}_identify")
+    with exit_codes(stopped=(DiskError, Stopped)):
+        done = identify_parameters(case, data, set_ or [], folder, made=_shared, say=print_line)
+    print_line(f"results in {folder}/")
+    if done.fit.ended != "converged":
+        raise failure(f"stopped early: {done.fit.ended}", STOPPED)
 
 
 @app.command()

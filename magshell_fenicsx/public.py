@@ -8,7 +8,7 @@ from warnings import warn
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import opened
+from magshell_fenicsx.case.opened import opened, with_same_files
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -22,6 +22,7 @@ from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
 
 if TYPE_CHECKING:
     from magshell_fenicsx.studies.boundary import StabilityBoundary
+    from magshell_fenicsx.studies.identify import Identified
 
 Given: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
@@ -108,16 +109,39 @@ def follow(
 
 def boundary(
     file: Path | str,
-    over: str,
+    over: str | Sequence[str],
     settings: Sequence[str] = (),
     out: Path | str = "results/boundary",
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
 ) -> "StabilityBoundary":
-    """Follow the instability at the end of a case file in a second key; see `studies.boundary.boundary`."""
-    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+    """Follow the instability at the end of a case file in a second key; see `studies.boundary.boundary`.
 
+    With two keys, it is followed in the first for each value of the second: `studies.boundary_map.boundary_map`.
+    """
+    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
+    from magshell_fenicsx.studies.boundary_map import boundary_map
+
+    if not isinstance(over, str) and len(over) != 1:
+        return boundary_map(file, over, settings, out, comm, say, made=Case.from_source)
+    over = over if isinstance(over, str) else over[0]
     return follow_boundary(file, over, settings, out, comm, say, made=Case.from_source)
+
+
+def identify(
+    file: Path | str,
+    data: Path | str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/identify",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = lambda line: None,
+) -> "Identified":
+    """Find numbers of a case file from measured data; see `studies.identify.identify`."""
+    from magshell_fenicsx.studies.identify import identify as identify_parameters
+
+    return identify_parameters(
+        file, data, settings, out, comm, say, made=lambda source: with_same_files(Case.from_source(source), comm)
+    )
 
 
 def run(

@@ -36,6 +36,16 @@ magnetic: {remanent: {flux_density: 60 mT}, applied: {flux_density: 10 mT}}
 mesh: {degree: 3, refinement: 0.5}
 loading: {kind: pressure, until: limit}
 """  # in units, with a dimple, in a field
+STRIP = """
+shell: {geometry: strip, radius: 17.2 mm, width: 0.29, thickness: 0.84 mm, youngs_modulus: 900 kPa, poisson_ratio: 0.49}
+boundary: {root: clamped}
+points: {tip: [17.2 mm, 0 mm, 0 mm]}
+magnetic:
+  remanent: {polar: 80, flux_density: 143 mT}
+  applied: {polar: 0, flux_density: 20 mT}
+mesh: {degree: 3, refinement: 0.5}
+loading: {kind: field, points: 4}
+"""  # in units, bent by a field
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 
 

@@ -17,6 +17,7 @@ from magshell_fenicsx.output.store.table import read_rows
 OUT = CASES.parent / "docs" / "gallery"
 WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
 FIRST = (
+    "identify.png",
     "designed.png",
     "design.png",
     "boundary.png",
@@ -26,7 +27,10 @@ FIRST = (
     "gradients.png",
     "shell.png",
 )  # that there is
-OVER = {"arch_boundary": "loading.0.factor=0.5:1.9"}  # cases of magshell boundary -> the key that varies
+OVER = {  # cases of magshell boundary -> the keys that vary
+    "arch_boundary": ["loading.0.factor=0.5:1.9"],
+    "snap_map": ["shell.defect.amplitude=0.4:2:4", "magnetic.lambda_m=-0.004:0.004:5"],
+}
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
@@ -37,10 +41,12 @@ one core of a shared machine, kernels compiled. Made by `make gallery`.
 def row(file: Path) -> str:
     """Run a case; its part of the page."""
     data = read_source(file).data
-    kind = next((kind for kind in ("ensemble", "design") if kind in data), "run")
+    kind = next((kind for kind in ("ensemble", "design", "identify") if kind in data), "run")
     more = ["--samples", "20", "--seed", "1"] if kind == "ensemble" else []
+    if kind == "identify":
+        more = ["--data", f"cases/{file.stem}.csv"]
     if over := OVER.get(file.stem):
-        kind, more = "boundary", ["--over", over]
+        kind, more = "boundary", [word for each in over for word in ("--over", each)]
     command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
     before = os.times()
     said = subprocess.run(

@@ -42,6 +42,7 @@ from magshell_fenicsx.shape.sections import (
     Surface,
     SurfaceSection,
 )
+from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 
 if TYPE_CHECKING:
@@ -111,6 +112,8 @@ class Case(WithParts):
     """What is random, for `magshell ensemble`"""
     design: DesignSection | None = None
     """What varies and what is wanted, for `magshell design`"""
+    identify: IdentifySection | None = None
+    """Which numbers measured data are to determine, for `magshell identify`"""
     output: OutputSection = OutputSection.model_construct()
     """How pictures look"""
     reactions: bool | None = None

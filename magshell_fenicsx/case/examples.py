@@ -47,8 +47,11 @@ def _text(file: Path) -> str:
 
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
-    """The case, and the mesh file that it names, which comes to stand beside it."""
+    """The case, and the mesh file that it names or the data of its name, which come to stand beside it."""
     text, mesh = _text(source), read_source(source).data["shell"].get("file")
+    data = source.with_suffix(".csv")
+    if data.exists():
+        return {target: text.encode(), target.with_suffix(".csv"): data.read_bytes()}
     if mesh is None:
         return {target: text.encode()}
     beside = Path(mesh).name

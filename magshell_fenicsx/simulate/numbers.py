@@ -40,6 +40,7 @@ ELSEWHERE = (
     "gradients",
     "ensemble",
     "design",
+    "identify",
     "output",
 )
 

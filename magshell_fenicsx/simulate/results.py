@@ -76,8 +76,8 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         point, i = points[of]
         by_u = scene.problem.length * (_turned(scene) @ model.probe(point))[i]
         return Functional(scene.observe(state)[of], system.held(by_u))
-    if of in (conjugates := _conjugates(scene)):
-        name, unit = conjugates[of]
+    if of in (known := conjugates(scene)):
+        name, unit = known[of]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
         return Functional(value, by_u, potentials={name: -1 / unit})
@@ -101,7 +101,7 @@ def differentiable(scene: Scene, state: State) -> list[str]:
     rooms = (column for room in SEEN for column in room.differentiable(scene.problem.loads))
     amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.history)
     found = dict.fromkeys(
-        ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *rooms, *amplitudes)
+        ("energy", *conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *rooms, *amplitudes)
     )
     return [*found, *scene.sizes.columns(found)]
 
@@ -141,7 +141,7 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
     return Functional(value, system.held(system.at(state).stiffness_along(e)), reaction=e)
 
 
-def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
+def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
     model, loads = scene.model, scene.problem.loads
     found = {"volume_change": "pressure"} if loads.pressure else {}

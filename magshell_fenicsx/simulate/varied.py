@@ -38,6 +38,14 @@ SAME = 1e-10  # relative differences of forces that are rounding
 KEPT = 8  # scenes
 
 
+class NoInstability(CaseError):
+    """The case ends without an instability."""
+
+
+class Excluded(CaseError):
+    """The instability is one that the model excludes."""
+
+
 class NoInfluence(CaseError):
     """The number changes nothing at the instability."""
 
@@ -47,17 +55,29 @@ def instability(records: Sequence[Record]) -> Record:
 
     Raises
     ------
-    CaseError
+    NoInstability
         If there is none.
     """
     own = [record for record in records if not record.branch]
     located = [record for record in own if record.label in LOCATED and record.step == own[-1].step]
     if not located:
-        raise CaseError(
+        raise NoInstability(
             "the case ends without an instability, and a boundary is that of a fold or a bifurcation: give its last "
             "step until: limit, and a load that reaches one"
         )
     return located[0]
+
+
+def refuse_excluded(mode: str) -> None:
+    """See that a model has the mode of an instability.
+
+    Raises
+    ------
+    Excluded
+        If it has not.
+    """
+    if mode.startswith("m = ") or mode == "antisymmetric":
+        raise Excluded(f"the instability is one that the model excludes ({mode}): take symmetry: none")
 
 
 class Varied:
@@ -130,8 +150,7 @@ class Varied:
 
     def _refuse_unknown(self, scene: Scene) -> None:
         record, programme = self._record, scene.problem.programme
-        if record.mode.startswith("m = ") or record.mode == "antisymmetric":
-            raise CaseError(f"the instability is one that the model excludes ({record.mode}): take symmetry: none")
+        refuse_excluded(record.mode)
         earlier = programme[: record.step - 1]
         step = programme[record.step - 1]
         if earlier and any(how != "load" for how in step.load.hold.values()):

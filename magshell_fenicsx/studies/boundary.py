@@ -36,7 +36,7 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import Varied, instability
+from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
@@ -44,7 +44,7 @@ from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, k
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
-ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "output")
+ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "identify", "output")
 STEPS, MOST_STEPS = 20, 1000
 ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 SPECIAL = ("cusp", "turn", "meeting")
@@ -186,6 +186,7 @@ def boundary(
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say))
         if not begin["label"]:
             instability([])
+        refuse_excluded(begin["mode"])
         once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 

@@ -52,6 +52,54 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     plt.close(figure)
 
 
+def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:
+    """Draw the boundaries in their own key, one line a value of the second, and cusps in the plane of both keys.
+
+    Parameters
+    ----------
+    rows, content
+        As in boundary.csv and map.json.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (plot, plane) = plt.subplots(1, 2, figsize=(10.2, 4.2), layout="constrained")
+    names = [
+        short(key).replace("_", " ") + (f"  ({unit})" if unit else "")
+        for key, unit in zip(content["keys"], content["units"], strict=True)
+    ]
+    values = content["values"]
+    shade = plt.Normalize(min(values), max(values) if max(values) > min(values) else min(values) + 1)
+    for value in dict.fromkeys(row["second"] for row in rows):
+        line = [row for row in rows if row["second"] == value]
+        colour = plt.cm.viridis(0.9 * shade(value))
+        keys, loads = [row["key"] for row in line], [row["load"] for row in line]
+        other = line[0]["amplitude"] != content["load"]
+        if not other:
+            plot.plot(keys, loads, color=colour, label=f"{value:g}")
+        how = {"ls": "--", "lw": 1.2, "label": f"by {line[0]['amplitude']}"} if other else {"lw": 3, "alpha": 0.6}
+        plane.plot([min(keys), max(keys)], [value, value], color=colour, **how)
+    for kind, mark in MARKS.items():
+        own = [row for row in rows if row["kind"] == kind]
+        if own:
+            drawn = [row for row in own if row["amplitude"] == content["load"]]
+            plot.plot([row["key"] for row in drawn], [row["load"] for row in drawn], mark, color="C3", zorder=5)
+            plane.plot(
+                [r["key"] for r in own], [r["second"] for r in own], mark, color="C3", label=WORDS[kind], zorder=5
+            )
+    for value in set(values) - {row["second"] for row in rows}:
+        plane.plot(content["range"], [value, value], ":", color="0.5")
+    plot.set(xlabel=names[0], ylabel=quantity(amplitude(content["load"]).column).label, title=content["case"])
+    plot.legend(frameon=False, fontsize=8, title=names[1], title_fontsize=8)
+    plane.set(xlabel=names[0], ylabel=names[1], title="where it loses its stability (dotted: nowhere)")
+    if plane.get_legend_handles_labels()[1]:
+        plane.legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=200)
+    plt.close(figure)
+
+
 def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:
     """The two folds of the first cusp, from it on; None without one."""
     at = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)

@@ -1,6 +1,7 @@
 """Boundaries of stability: a shallow arch against its closed form and against runs, resume, and what is refused."""
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +127,38 @@ def test_through_a_field_of_zero(tmp_path: Path) -> None:
     ends = {row["key"]: row["load"] for row in (found.rows[0], found.rows[-1])}
     assert ends == pytest.approx({-0.00184: 0.120723848, 0.00184: 0.552053778}, rel=1e-6)
     assert not found.special
+
+
+@pytest.mark.slow
+def test_a_map_of_boundaries(tmp_path: Path) -> None:
+    """On springs the arch snaps later, or not at all: each line is the boundary of its case alone."""
+    over, second = f"{KEY}=1.1:1.3:2", "foundation.stiffness=1e-12,1e-9,1e-4"
+    out = tmp_path / "map"
+    fixed = [f"{KEY}=1.3", "loading.1.until=target", "loading.1.factor=6"]
+    words = [word for setting in fixed for word in ("--set", setting)]
+    done = magshell("boundary", ARCH, "--over", over, "--over", second, *words, "--out", out)
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((out / "boundary.csv").open()))
+    content = json.loads((out / "map.json").read_text())
+    assert list(content["without"]) == ["1e-4"]
+    assert "the case ends without an instability" in content["without"]["1e-4"]
+    assert (out / "boundary.png").stat().st_size > 10_000
+    alone = ms.boundary(ARCH, over, [*fixed, "foundation.stiffness=1e-9"], tmp_path / "alone")
+    own = [row for row in rows if float(row["second"]) == 1e-9]
+    assert [float(row["load"]) for row in own] == pytest.approx([row["load"] for row in alone.rows], rel=1e-9)
+    assert {float(row["second"]) for row in rows} == {1e-12, 1e-9}
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        (f"{KEY}=1:2:3", "the second key of a map is another number"),
+        ("shell.law=koiter,neo-hookean", "the second key of a map is another number"),
+        ("mesh.size=0.1,0.2", "the second key of a map is another number"),
+    ],
+)
+def test_what_is_no_map(tmp_path: Path, second: str, said: str) -> None:
+    with pytest.raises(CaseError, match=said):
+        ms.boundary(ARCH, [f"{KEY}=1.1:1.3:2", second], [], tmp_path / "b")
+    with pytest.raises(CaseError, match="3 keys; a boundary takes one"):
+        ms.boundary(ARCH, [f"{KEY}=1.1:1.3:2", second, second], [], tmp_path / "b")

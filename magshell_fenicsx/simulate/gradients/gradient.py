@@ -39,8 +39,12 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
     return by_load(adjoint, name)
 
 
-def by_number(adjoint: Adjoint, key: str) -> float:
-    """By a central difference of the contracted equations, on the same mesh: nothing is solved."""
+def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
+    """By a central difference of the contracted equations, on the same mesh: nothing is solved.
+
+    `others` keeps the scenes with other values of this number, for further results of the same scene.
+    """
+    others = {} if others is None else others
     scene = adjoint.scene
     value = number_of(scene.problem.context, key)
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
@@ -51,7 +55,9 @@ def by_number(adjoint: Adjoint, key: str) -> float:
         )
 
     def contracted(p: float) -> float:
-        other = scene if p == value else scene_with(scene, key, p)
+        if p != value and p not in others:
+            others[p] = scene_with(scene, key, p)
+        other = scene if p == value else others[p]
         first, total = adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
             own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
@@ -198,12 +204,12 @@ def gradient(
     return {name: derivative(found, name) for name in ([by] if isinstance(by, str) else by)}
 
 
-def derivative(adjoint: Adjoint, by: str) -> Gradient:
-    """The derivative by one parameter, in the unit of the result; see `gradient`."""
+def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
+    """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number` for `others`."""
     size = adjoint.size
     if by in FIELDS:
         found = by_field(adjoint, by)
         return replace(found, forces=size * found.forces)
     if by in adjoint.state.mu:
         return size * by_amplitude(adjoint, by)
-    return size * by_number(adjoint, by) + adjoint.value * size_by_number(adjoint, by)
+    return size * by_number(adjoint, by, others) + adjoint.value * size_by_number(adjoint, by)

@@ -1,0 +1,134 @@
+"""A map of boundaries of stability: the boundary in a key, for each value of a second one."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.varied import Excluded, NoInstability
+from magshell_fenicsx.studies.boundary import COLUMNS, ELSEWHERE, StabilityBoundary, boundary, parse_range
+from magshell_fenicsx.studies.boundary_picture import draw_map
+from magshell_fenicsx.studies.points import Axis, parse_axis
+from magshell_fenicsx.studies.runner import Folder, Made, Say
+
+FOLDER = Folder(
+    "a map of boundaries", ("map.json", "boundary.csv", "boundary.png"), ("case", "keys", "without"), "boundaries"
+)
+
+
+def second_axis(text: str, first: str) -> Axis:
+    """Read the second `--over`.
+
+    Raises
+    ------
+    CaseError
+        If it is no list of numbers of one other key.
+    """
+    axis = parse_axis(text)
+    if len(axis.keys) > 1 or axis.numbers is None or axis.name == first or axis.name.split(".")[0] in ELSEWHERE:
+        raise CaseError(
+            f"--over {text}: the second key of a map is another number of the shell or its loads, written as "
+            "key.path=first:last:count or key.path=value,value,..."
+        )
+    return axis
+
+
+def boundary_map(
+    file: Path | str,
+    overs: Sequence[str],
+    settings: Sequence[str] = (),
+    out: Path | str = "results/boundary",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+    *,
+    made: Made,
+) -> StabilityBoundary:
+    """Follow the instability of a case in one key, for each value of a second one; collective.
+
+    Parameters
+    ----------
+    overs
+        The first key with its range, as for `boundary`, and the second with its values, as for a sweep.
+    out
+        Folder of boundary.csv (with the columns `second` and `amplitude`, whose load it is), map.json, boundary.png and
+        boundaries/, a folder for each value; what these have is kept.
+
+    Returns
+    -------
+    All boundaries one after the other, with the value of the second key in each row.
+
+    Raises
+    ------
+    CaseError
+        See `boundary`; or if there is an instability at no value of the second key.
+    """
+    if len(overs) != 2:
+        raise CaseError(f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two")
+    span = parse_range(overs[0])
+    axis = second_axis(overs[1], span.key)
+    for setting in settings:
+        if setting.partition("=")[0].strip() == axis.name:
+            raise CaseError(f"--set {setting}: this key is swept by --over")
+    folder, once = given_folder(out), say if comm.rank == 0 else (lambda line: None)
+    rows, without, lines = list[dict[str, Any]](), dict[str, str](), dict[str, StabilityBoundary]()
+    with FOLDER.held(folder, comm, Path(file).name):
+        for number, value in enumerate(axis.values, 1):
+            once(f"{axis.name} = {value}, {number} of {len(axis.values)}")
+            own = [*settings, f"{axis.name}={value}"]
+            try:
+                found = boundary(file, overs[0], own, folder / "boundaries" / f"{number:03d}", comm, say, made=made)
+            except (Excluded, NoInstability, Stopped) as e:
+                without[value] = str(e)
+                once(f"{axis.name} = {value}: no boundary: {e}")
+                continue
+            lines[value] = found
+            rows += [{"second": axis.number(value), "amplitude": found.content["load"], **row} for row in found.rows]
+        if not rows:
+            raise CaseError(f"--over {overs[1]}: the case has an instability at none of these values")
+        content = _content(file, settings, lines, without, axis)
+        done = StabilityBoundary(rows, content)
+        by_first(comm, lambda: _write(done, folder))
+    for line in content["said"]:
+        once(line)
+    return done
+
+
+def _content(
+    file: Path | str,
+    settings: Sequence[str],
+    lines: dict[str, StabilityBoundary],
+    without: dict[str, str],
+    axis: Axis,
+) -> dict[str, Any]:
+    first, loads = next(iter(lines.values())).content, [line.content["load"] for line in lines.values()]
+    special = [{"second": axis.number(value), **each} for value, line in lines.items() for each in line.special]
+    said = [f"{axis.name} = {value}: {text}" for value, line in lines.items() for text in line.content["said"]]
+    return {
+        "case": Path(file).name,
+        "settings": list(settings),
+        "keys": [first["key"], axis.name],
+        "units": [first["unit"], axis.unit],
+        "range": [first["from"], first["to"]],
+        "values": [axis.number(value) for value in axis.values],
+        "load": max(loads, key=loads.count),
+        "kinds": {value: f"{line.content['kind']} {line.content['mode']}".strip() for value, line in lines.items()},
+        "special": special,
+        "said": said + [f"{axis.name} = {value}: no boundary" for value in without],
+        "without": without,
+        "stopped": [f"{axis.name} = {value}: {why}" for value, line in lines.items() for why in line.stopped],
+    }
+
+
+def _write(done: StabilityBoundary, folder: Path) -> None:
+    more = dict.fromkeys(name for row in done.rows for name in row if name not in ("second", "amplitude", *COLUMNS))
+    columns = ("second", "amplitude", *COLUMNS, *more)
+    write_object(folder / "map.json", done.content)
+    write_csv([{name: row.get(name, "") for name in columns} for row in done.rows], columns, folder / "boundary.csv")
+    draw_map(done.rows, done.content, folder / "boundary.png")

@@ -1,0 +1,458 @@
+"""Parameters of a case from measured data: the fit, its posterior, and what to measure next.
+
+Every evaluation is kept: an identification that is started again takes those in its folder and goes on.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from mpi4py import MPI
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.simulate.gradients.instabilities import Lost
+from magshell_fenicsx.simulate.readings import Outside, Reading, read
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.design_blocks import Number
+from magshell_fenicsx.studies.identify_data import Names, Parameter, Table, candidate, parameters_of, table_of
+from magshell_fenicsx.studies.identify_picture import draw_identified
+from magshell_fenicsx.studies.identify_sections import IdentifySection
+from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.points import identity, short
+from magshell_fenicsx.studies.runner import Folder, Made, Say, keep, kept
+
+Array = NDArray[np.float64]
+FOLDER = Folder(
+    "an identification", ("identify.json", "identify.csv", "identify.png"), ("case", "parameters", "predicted")
+)
+NOTHING = 1e-9  # change of a result over that of a parameter, both relative: it has no influence
+ALIKE = 0.95  # correlation from which two parameters are hardly told apart
+PRIOR = 0.9  # part of the prior's deviation above which data say little
+UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
+Settings = tuple[str, ...]
+
+
+@dataclass
+class Seen:
+    """What is predicted for a vector of parameters; with a note there is nothing.
+
+    Attributes
+    ----------
+    values, slopes
+        (n,) and (n, p), in the units of data and parameters.
+    curves
+        Result -> places and values along the path, of the case without settings of rows.
+    invalid
+        Whether there is nothing as data are outside the path, or the case is none.
+    """
+
+    values: list[float] = field(default_factory=list)
+    slopes: list[list[float]] = field(default_factory=list)
+    curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    note: str = ""
+    invalid: bool = False
+
+
+@dataclass
+class Predictor:
+    """Predicts readings for vectors of parameters; collective.
+
+    Attributes
+    ----------
+    readings
+        Settings of the case -> what is read there.
+    """
+
+    source: Source
+    made: Made
+    parameters: Sequence[Parameter]
+    readings: dict[Settings, list[Reading]]
+    folder: Path
+    mark: str
+    comm: MPI.Comm
+    count: int = 0
+
+    def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
+        """What is predicted, known or new."""
+        x = np.array(self.comm.bcast(x))
+        listed = json.dumps([[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()])
+        text = f"{self.mark} {listed} {slopes}".encode()
+        file = self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
+        known = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
+        if known is None:
+            known = Seen(**self.comm.bcast(asdict(self._new(x, slopes))))
+            self.count += 1
+            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(known)}))
+        return known
+
+    def _new(self, x: Array, slopes: bool) -> Seen:
+        seen = Seen()
+        for settings, wanted in self.readings.items():
+            try:
+                found = read(self._scene(x, settings), wanted, [each.key for each in self.parameters], slopes=slopes)
+            except (Lost, CaseError, MeshError) as e:
+                note = f"{', '.join(settings)}: {e}" if settings else str(e)
+                return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
+            seen.values += [float(v) for v in found.values]
+            sizes = [each.number.gradient(x, None, {each.key: 1.0})[0] for each in self.parameters]  # type: ignore[arg-type]
+            seen.slopes += (found.slopes * sizes).tolist()
+            seen.curves = seen.curves or found.curves
+        return seen
+
+    def _scene(self, x: Array, settings: Settings) -> Scene:
+        source = varied(self.source, [each.number for each in self.parameters], x)
+        for setting in settings:
+            override(source, setting)
+        return Scene(self.made(source).problem(), self.comm)
+
+
+def varied(source: Source, numbers: Sequence[Number], x: Array) -> Source:
+    """The source of a case with other numbers."""
+    data = json.loads(json.dumps(source.data))
+    data.pop("identify", None)
+    for number, value in zip(numbers, x, strict=True):
+        number.put(data, np.array([value]))
+    return Source(source.name, data, folder=source.folder, files=source.files)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A finished identification.
+
+    Attributes
+    ----------
+    content
+        As in identify.json.
+    fit
+        The parameters, in the units of the case.
+    """
+
+    content: dict[str, Any]
+    fit: Fit
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Key -> value, deviation, low and high of its 95 % band, unit, and its prior."""
+        return dict(self.content["parameters"])
+
+
+def identify(
+    file: Path | str,
+    data: Path | str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/identify",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+    *,
+    made: Made,
+) -> Identified:
+    """Find the numbers of a case that fit measured data, and how sure they are; collective.
+
+    Parameters
+    ----------
+    data
+        A CSV file; see `IdentifySection`.
+    out
+        Folder of identify.json, identify.csv (data, predictions and bands), identify.png and points/.
+    made
+        Makes a case of its source, the same on all ranks.
+
+    Raises
+    ------
+    CaseError
+        If the case looks for nothing, the data are none of its results or outside its path, a parameter has no
+        influence, or data and priors do not determine all of them.
+    Stopped
+        If the path of the case is lost.
+    """
+    source = from_first(comm, lambda: read_source(Path(file), settings))
+    case, folder, name = made(source), given_folder(out), Path(file).name
+    section: IdentifySection | None = case.identify
+    if section is None:
+        raise CaseError(f"{file}: identify: is missing: it says which parameters are looked for")
+    try:
+        parameters = parameters_of(source, case, section)
+        table = from_first(comm, lambda: table_of(Path(data), case, section))
+        names = Names(case)
+        others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
+        _refuse_few(table, parameters)
+        with FOLDER.held(folder, comm, name):
+            once: Say = say if comm.rank == 0 else lambda line: None
+            mark = identity(case) + repr([each.key for each in parameters])
+            predictor = Predictor(source, made, parameters, dict(table.readings), folder, mark, comm)
+            done, drawn = _identified(predictor, section, table, others, once)
+            done.content.update(case=name, data=Path(data).name, settings=list(settings))
+            by_first(comm, lambda: _write(done, drawn, folder))
+    except CaseError as e:
+        raise CaseError(case.placed(str(e))) from None
+    for line in done.content["said"]:
+        once(line)
+    return done
+
+
+def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
+    """See that there are data enough.
+
+    Raises
+    ------
+    CaseError
+        If there are fewer than parameters without a prior, or too few to estimate their noise.
+    """
+    bare = [each.key for each in parameters if np.isinf(each.deviation)]
+    if len(table.data) < len(bare):
+        raise CaseError(
+            f"identify.parameters: {len(table.data)} data do not determine {len(bare)} parameters without a prior "
+            f"({', '.join(bare)}): give prior and deviation of {len(bare) - len(table.data)} of them, or more data"
+        )
+    keys = {setting.partition("=")[0] for settings in table.readings for setting in settings}
+    if both := next((each.key for each in parameters if each.key in keys), None):
+        raise CaseError(f"identify.parameters.{both}: is a column of the data, so it is known")
+    for number, column in enumerate(table.columns):
+        count = int((table.column == number).sum())
+        if np.isnan(column.noise) and count <= len(bare):
+            raise CaseError(
+                f"identify.noise: {column.header}: {count} data do not say the noise beside {len(bare)} parameters: "
+                "give it"
+            )
+
+
+def _identified(
+    predictor: Predictor,
+    section: IdentifySection,
+    table: Table,
+    others: Sequence[tuple[Reading, str, float]],
+    say: Say,
+) -> tuple[Identified, Callable[[Path], None]]:
+    parameters = predictor.parameters
+    start = np.array([each.start for each in parameters])
+    prior = np.array([[each.mean, each.deviation] for each in parameters]).T
+    noise = np.array([column.noise for column in table.columns])
+    known = Measured(table.data, table.column, noise, *prior)
+    finite = np.where(np.isfinite(prior[1]), prior[1], np.abs(start))
+    size = np.where(finite > 0, finite, 1.0)
+    first = predictor(start)
+    if first.note:
+        raise (CaseError if first.invalid else Stopped)(f"the case itself does not predict the data: {first.note}")
+    _refuse_idle(np.array(first.slopes), np.array(first.values), size, parameters)
+
+    def model(x: Array, *, slopes: bool = True) -> tuple[Array, Array] | None:
+        seen = predictor(x, slopes=slopes)
+        if seen.note:
+            say(f"       {_said(parameters, x)}: {seen.note}")
+            return None
+        return np.array(seen.values), np.array(seen.slopes)
+
+    def told(step: int, x: Array, misfit: float) -> None:
+        say(f"{step:5d}  misfit {misfit:.4g} of the noise squared, {_said(parameters, x)}")
+
+    try:
+        fit = fitted(model, known, start, size, section.steps, told)
+    except NotSeen as e:
+        alike = [parameters[number].key for number in e.numbers]
+        raise CaseError(
+            f"identify.parameters: {' and '.join(alike)} cannot be told apart by these data: give one of them a prior"
+        ) from None
+    bent, lost = nonlinearity(partial(model, slopes=False), known, fit)
+    content = _content(predictor, section, table, known, fit)
+    content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
+    content["predicted"], content["next"] = _others(predictor, section, fit, others)
+    content["evaluations"] = predictor.count
+    content["said"] = _sentences(content, fit, known, table)
+    drawn = partial(draw_identified, content, _curves(predictor, table, fit))
+    return Identified(content, fit), drawn
+
+
+def _said(parameters: Sequence[Parameter], x: Array) -> str:
+    return ", ".join(f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=True))
+
+
+def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]) -> None:
+    """See that every parameter changes something.
+
+    Raises
+    ------
+    CaseError
+        With the name of one that does not.
+    """
+    strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
+    if idle := [p.key for p, change in zip(parameters, strongest, strict=True) if change < NOTHING]:
+        raise CaseError(f"identify.parameters: {', '.join(idle)}: has no influence on these data where the case starts")
+
+
+def _content(predictor: Predictor, section: IdentifySection, table: Table, known: Measured, fit: Fit) -> dict[str, Any]:
+    """What is found, as plain data."""
+    low, high = fit.band
+    found = {
+        p.key: {
+            "value": float(fit.x[i]),
+            "deviation": float(fit.deviation[i]),
+            "low": float(low[i]),
+            "high": float(high[i]),
+            "unit": p.unit,
+            "start": p.start,
+            "prior": None if np.isinf(p.deviation) else {"mean": p.mean, "deviation": p.deviation},
+        }
+        for i, p in enumerate(predictor.parameters)
+    }
+    spread, s = fit.spread(fit.slopes), fit.noise[table.column]
+    listed = [(settings, each) for settings, of in table.readings.items() for each in of]
+    rows = [
+        {
+            "result": each.of,
+            "settings": "; ".join(settings),
+            "at": "end" if each.at is None else each.at,
+            "measured": float(table.data[i]),
+            "predicted": float(fit.y[i]),
+            "low": float(fit.y[i] - fit.quantile * spread[i]),
+            "high": float(fit.y[i] + fit.quantile * spread[i]),
+            "noise": float(s[i]),
+            "low_measured": float(fit.y[i] - fit.quantile * np.hypot(spread[i], s[i])),
+            "high_measured": float(fit.y[i] + fit.quantile * np.hypot(spread[i], s[i])),
+        }
+        for i, (settings, each) in enumerate(listed)
+    ]
+    noise = {
+        column.header: {
+            "deviation": float(fit.noise[i]),
+            "unit": column.unit,
+            "estimated": bool(np.isnan(known.noise[i])),
+            "degrees_of_freedom": None if np.isinf(fit.freedom[i]) else float(fit.freedom[i]),
+        }
+        for i, column in enumerate(table.columns)
+    }
+    return {
+        "parameters": found,
+        "correlation": fit.correlation.tolist(),
+        "covariance": fit.covariance.tolist(),
+        "noise": noise,
+        "places": table.places,
+        "misfit_over_noise": float(np.sqrt(np.mean(((known.data - fit.y) / s) ** 2))),
+        "quantile": fit.quantile,
+        "steps": fit.steps,
+        "ended": fit.ended,
+        "rows": rows,
+        "sources": code_version(),
+    }
+
+
+def _others(
+    predictor: Predictor, section: IdentifySection, fit: Fit, others: Sequence[tuple[Reading, str, float]]
+) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+    """The candidates with their bands, and which of them narrows a parameter most."""
+    if not others:
+        return [], None
+    keys = [each.key for each in predictor.parameters]
+    size = np.where(fit.x != 0, np.abs(fit.x), 1.0)
+    chosen = keys.index(section.narrow) if section.narrow else int(np.argmax(fit.deviation / size))
+    found = list[dict[str, Any]]()
+    for reading, unit, noise in others:
+        alone = Predictor(
+            predictor.source,
+            predictor.made,
+            predictor.parameters,
+            {(): [reading]},
+            predictor.folder,
+            predictor.mark,
+            predictor.comm,
+        )
+        seen, row = (
+            alone(fit.x),
+            {"result": reading.of, "at": "end" if reading.at is None else reading.at, "unit": unit},
+        )
+        predictor.count += alone.count
+        if seen.note:
+            found.append({**row, "note": seen.note})
+            continue
+        slope = np.array(seen.slopes[0])
+        value, spread = seen.values[0], float(fit.spread(slope[None])[0])
+        narrowed = {key: float(v) for key, v in zip(keys, fit.narrowed(slope, noise), strict=True)}
+        low, high = value - fit.quantile * spread, value + fit.quantile * spread
+        found.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
+    there = [each for each in found if "value" in each]
+    if not there:
+        return found, None
+    best = min(there, key=lambda each: each["deviations_then"][keys[chosen]])
+    then = best["deviations_then"][keys[chosen]]
+    how = {"parameter": keys[chosen], "from": float(fit.deviation[chosen]), "to": then}
+    return found, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
+
+
+def _sentences(content: dict[str, Any], fit: Fit, known: Measured, table: Table) -> list[str]:
+    """What is found, in words."""
+    said, keys = list[str](), list(content["parameters"])
+    for key, each in content["parameters"].items():
+        unit = f" {each['unit']}" if each["unit"] else ""
+        said.append(f"{key} = {each['value']:.6g}{unit}, 95 % between {each['low']:.6g} and {each['high']:.6g}{unit}")
+        if each["prior"] and each["deviation"] > PRIOR * each["prior"]["deviation"]:
+            said.append(f"{key}: the data add little to its prior")
+    for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
+        if abs(c := float(fit.correlation[i, j])) > ALIKE:
+            said.append(f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation {c:+.4f}")
+    for header, each in content["noise"].items():
+        how = "estimated" if each["estimated"] else "given"
+        said.append(f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}")
+    if not np.isnan(known.noise).any():
+        square = float((((known.data - fit.y) / fit.noise[table.column]) ** 2).sum())
+        if scipy.stats.chi2.sf(square, max(len(known.data), 1)) < UNLIKELY:
+            said.append(
+                f"warning: the misfit is {content['misfit_over_noise']:.3g} times the noise: the model does not "
+                "describe these data, or their noise is larger; leave it out to have it estimated"
+            )
+    bent, lost = content["normal"]["difference"], content["normal"]["lost"]
+    if bent > NORMAL or lost:
+        nowhere = f", and at {lost} such places nothing is predicted" if lost else ""
+        said.append(
+            f"warning: two deviations away the misfit differs by {100 * bent:.0f} % from its parabola{nowhere}: "
+            "the bands are rough"
+        )
+    if content["ended"] != "converged":
+        said.append(f"warning: the fit has not converged: {content['ended']}")
+    for each in content["predicted"]:
+        place = f" at {each['at']:g}" if each["at"] != "end" else ""
+        if "note" in each:
+            said.append(f"{each['result']}{place}: is not predicted: {each['note']}")
+            continue
+        said.append(
+            f"{each['result']}{place} = {each['value']:.6g} {each['unit']}".rstrip()
+            + f" predicted, 95 % between {each['low']:.6g} and {each['high']:.6g}"
+        )
+    if best := content["next"]:
+        place = "" if best["at"] == "end" else f" at {best['at']:g}"
+        said.append(
+            f"next: {best['result']}{place} narrows {best['parameter']} most: "
+            f"deviation {best['from']:.3g} -> {best['to']:.3g}"
+        )
+    return said
+
+
+def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tuple[float, float]]]:
+    """Result -> the path at the fit, as far as data go."""
+    seen, found = predictor(fit.x), dict[str, list[tuple[float, float]]]()
+    for of, curve in seen.curves.items():
+        places = [r.at for each in table.readings.values() for r in each if r.of == of and r.at is not None]
+        upto = next((i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))), len(curve) - 1)
+        found[of] = curve[: upto + 1]
+    return found
+
+
+def _write(done: Identified, drawn: Callable[[Path], None], folder: Path) -> None:
+    write_object(folder / "identify.json", done.content)
+    rows = done.content["rows"]
+    write_csv(rows, list(rows[0]), folder / "identify.csv")
+    drawn(folder / "identify.png")

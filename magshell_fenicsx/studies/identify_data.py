@@ -1,0 +1,312 @@
+"""What `magshell identify` is given: measured columns as readings of a case, and numbers of it with their priors."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.section import in_unit, number_and_unit
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.tables import TableError, column_size, read_table
+from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
+from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
+from magshell_fenicsx.simulate.gradients.vibration import NAMES
+from magshell_fenicsx.simulate.numbers import number_of
+from magshell_fenicsx.simulate.readings import Places, Reading
+from magshell_fenicsx.simulate.results import differentiable
+from magshell_fenicsx.studies.design_blocks import Number
+from magshell_fenicsx.studies.identify_sections import Amount, CandidateSection, IdentifySection
+from magshell_fenicsx.studies.points import value_at
+from magshell_fenicsx.studies.runner import Case
+
+Array = NDArray[np.float64]
+HEADER = re.compile(r"\s*([\w.]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
+MOST_READINGS = 10_000
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that is looked for, in its unit.
+
+    Attributes
+    ----------
+    mean, deviation
+        Of its prior; without one the deviation is infinite.
+    """
+
+    number: Number
+    mean: float
+    deviation: float
+
+    @property
+    def key(self) -> str:
+        return self.number.name
+
+    @property
+    def unit(self) -> str:
+        return self.number.unit
+
+    @property
+    def start(self) -> float:
+        return float(self.number.start[0])
+
+
+@dataclass(frozen=True)
+class Column:
+    """A measured result: its name in the file, and in the case's unit.
+
+    Attributes
+    ----------
+    noise
+        Its standard deviation in the case's unit; nan if it is to be estimated.
+    """
+
+    header: str
+    of: str
+    unit: str
+    noise: float
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was measured.
+
+    Attributes
+    ----------
+    columns
+        The results.
+    readings
+        Settings of the case, as for `--set` -> readings, in the order of the data.
+    data, column
+        (n,) the numbers in the case's units, and which column each is of.
+    places
+        The column of the places; "" without.
+    """
+
+    columns: tuple[Column, ...]
+    readings: Mapping[tuple[str, ...], list[Reading]]
+    data: Array
+    column: NDArray[np.int64]
+    places: str
+
+
+class Names:
+    """The results of a case, and what its last step prescribes, by their names in a file."""
+
+    def __init__(self, case: Case) -> None:
+        self.scene = Expected(case.problem())
+        try:
+            self.places: Places | None = Places(self.scene)
+        except CaseError:
+            self.places = None
+
+    def of(self, name: str, unit: str | None, where: str) -> tuple[str, str, float]:
+        """The result of a name with a unit, the case's unit, and what one of that unit is in it.
+
+        Raises
+        ------
+        CaseError
+            If there is no such result, or a unit is missing.
+        """
+        scene = self.scene
+        shown = {q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))}
+        shown |= {of: (of, of.rpartition("_")[2]) for of in SCALES} | {"hertz_1": ("hertz_1", "Hz")}
+        if unit is None:
+            near = next((of for of in shown if of.startswith(f"{name}_") and shown[of][0] == name), None)
+            if near and near != name:
+                raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
+            own = shown.get(name, ("", ""))[1]
+            found = name
+            factor = 1.0
+        else:
+            fitting = [of for of in shown if of == name or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", of)]
+            if not fitting:
+                raise CaseError(
+                    f"{where}: {name}: has the unit {unit}, but no result of this name has one in this case"
+                )
+            found = min(fitting, key=len)
+            own = shown[found][1]
+            try:
+                factor = column_size(name, unit, own)
+            except TableError as e:
+                raise CaseError(f"{where}: {e}") from None
+        if self.places is None or found != self.places.column:
+            refuse_no_result(scene, [found], where)
+            if found in SCALES:
+                refuse_unitless(scene, found)
+        return found, own, factor
+
+    @property
+    def _bare(self) -> list[str]:
+        scene = self.scene
+        own = [self.places.bare] if self.places else []
+        return [*own, *(name for name in differentiable(scene, scene.unloaded()) if name not in own)]
+
+    def amount(self, amount: Amount, of: str, where: str) -> float:
+        """A number for a result, in its unit of the case.
+
+        Raises
+        ------
+        CaseError
+            If its unit is missing or another one.
+        """
+        number, unit = number_and_unit(str(amount))
+        _, own, factor = self.of(of, None, where) if not unit else self._of_unit(of, unit, where)
+        if own and not unit and float(number):
+            raise CaseError(f"{where}: {_text(amount)}: needs a unit, such as {_text(amount)} {own}")
+        return float(number) * factor
+
+    def _of_unit(self, of: str, unit: str, where: str) -> tuple[str, str, float]:
+        found, own, _ = self.of(of, None, where)
+        if not own:
+            raise CaseError(f"{where}: {of} has no unit, so this number has none: {unit}")
+        try:
+            return found, own, column_size(of, unit, own)
+        except TableError as e:
+            raise CaseError(f"{where}: {e}") from None
+
+
+def _text(amount: Amount) -> str:
+    return amount if isinstance(amount, str) else f"{amount:g}"
+
+
+def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple[Parameter, ...]:
+    """The numbers that are looked for.
+
+    Raises
+    ------
+    CaseError
+        If a key has no number, or its prior another unit.
+    """
+    found = []
+    for key, known in section.parameters.items():
+        where = f"identify.parameters.{key}"
+        try:
+            number_of(case.context, key)
+            start, unit = _written(source, case, key)
+            mean, deviation = (_in_unit_of(unit, amount, key) for amount in (known.prior, known.deviation))
+        except CaseError as e:
+            raise CaseError(f"{where}: {e}") from None
+        if known.deviation is not None and not deviation > 0:
+            raise CaseError(f"{where}.deviation: must be positive, here {_text(known.deviation)}")
+        prior = (mean, deviation) if known.prior is not None else (start, np.inf)
+        found.append(Parameter(Number(key, np.array([start]), (0.0, 1.0), unit), *prior))
+    return tuple(found)
+
+
+def _written(source: Source, case: Case, key: str) -> tuple[float, str]:
+    """A number of the case as it is written, and its unit."""
+    written = value_at(source.data, key.split("."))
+    number, unit = number_and_unit(str(written))
+    return (float(number), unit) if number else (number_of(case.context, key), "")
+
+
+def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
+    if amount is None:
+        return np.nan
+    try:
+        if unit and not number_and_unit(str(amount))[1]:
+            raise ValueError
+        return in_unit(str(amount), unit)
+    except ValueError:
+        what = f"the unit {unit}" if unit else "no unit"
+        raise CaseError(f"{_text(amount)}: the case gives {key} with {what}: so has its prior") from None
+
+
+def table_of(file: Path, case: Case, section: IdentifySection) -> Table:
+    """The measured columns.
+
+    Raises
+    ------
+    CaseError
+        If a column is no result, has no unit, or the section names one that is not there.
+    """
+    try:
+        columns, units = read_table(file, Files())
+    except TableError as e:
+        raise CaseError(f"--data {file}: {e}") from None
+    names, where = Names(case), f"--data {file}"
+    at: Array = np.full(0, np.nan)
+    keys, results = dict[str, tuple[str, Array]](), list[tuple[Column, Array]]()
+    places = ""
+    for header, values in columns.items():
+        parts = HEADER.fullmatch(header)
+        name, unit = (parts[1], parts[2] or units[header]) if parts else (header, None)
+        if "." in name:
+            keys[name] = (unit or "", values)
+            continue
+        of, own, factor = names.of(name, unit, where)
+        if names.places and of == names.places.column:
+            at, places = values * factor, of
+            continue
+        noise = section.noise.get(name, section.noise.get(of))
+        known = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
+        if noise is not None and not known > 0:
+            raise CaseError(f"identify.noise.{name}: must be positive, here {_text(noise)}")
+        results.append((Column(name, of, own, known), values * factor))
+    if not results:
+        raise CaseError(f"{where}: has no column with a result of this case")
+    _refuse_unknown(section, [each for each, _ in results], where)
+    return _listed(results, keys, at, places, section, where)
+
+
+def _refuse_unknown(section: IdentifySection, columns: Iterable[Column], where: str) -> None:
+    there = {name for each in columns for name in (each.header, each.of)}
+    for key, named in (("noise", section.noise), ("changes", section.changes)):
+        if strange := next((name for name in named if name not in there), None):
+            raise CaseError(f"identify.{key}: {strange}: {where} has no such column, only {', '.join(sorted(there))}")
+
+
+def _listed(
+    results: list[tuple[Column, Array]],
+    keys: Mapping[str, tuple[str, Array]],
+    at: Array,
+    places: str,
+    section: IdentifySection,
+    where: str,
+) -> Table:
+    """Rows as readings, those of the same settings together; what is no number was not measured."""
+    readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
+    column = dict[tuple[str, ...], list[int]]()
+    for row in range(len(results[0][1])):
+        settings = tuple(f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items())
+        place = float(at[row]) if places else None
+        for number, (own, values) in enumerate(results):
+            value = float(values[row])
+            if np.isnan(value):
+                continue
+            bound = place is not None and own.of not in FOLDS and not NAMES.fullmatch(own.of) and own.of != "barrier"
+            change = own.of in section.changes or own.header in section.changes
+            readings.setdefault(settings, []).append(Reading(own.of, place if bound else None, change))
+            data.setdefault(settings, []).append(value)
+            column.setdefault(settings, []).append(number)
+    flat = np.array([value for each in data.values() for value in each])
+    if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
+        raise CaseError(f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite")
+    if places and np.isnan(at).any():
+        raise CaseError(f"{where}: {places}: has a row without a number")
+    numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
+    return Table(tuple(own for own, _ in results), readings, flat, numbers, places)
+
+
+def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Reading, str, float]:
+    """A further reading, its unit, and its noise.
+
+    Raises
+    ------
+    CaseError
+        If it is none.
+    """
+    of, unit, _ = names.of(section.of, None, f"{key}.of")
+    noise = names.amount(section.noise, of, f"{key}.noise")
+    if not noise > 0:
+        raise CaseError(f"{key}.noise: must be positive, here {_text(section.noise)}")
+    if section.at is None:
+        return Reading(of), unit, noise
+    if names.places is None:
+        raise CaseError(f"{key}.at: the case has no last step that prescribes a load or a displacement")
+    return Reading(of, names.amount(section.at, names.places.column, f"{key}.at")), unit, noise

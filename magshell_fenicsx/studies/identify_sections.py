@@ -1,0 +1,65 @@
+"""The section `identify` of a case: which numbers are looked for, what is known of them, what else may be measured."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.studies.sections import Measured
+
+Amount = float | Measured
+
+
+class ParameterSection(Section):
+    """What is known of a number before anything is measured: nothing, or its prior, a normal distribution."""
+
+    prior: Amount | None = None
+    """Its mean, in the unit of the key"""
+    deviation: Amount | None = None
+    """Its standard deviation, in the unit of the key"""
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if (self.prior is None) != (self.deviation is None):
+            raise ValueError("prior and deviation belong together")
+        return self
+
+
+class CandidateSection(Section):
+    """A further result: it is predicted with its 95 % band, and as a measurement compared with the others."""
+
+    of: str
+    """A result: a column of path.csv, knockdown, critical_field_mT, omega2_1, hertz_1, barrier, ..."""
+    at: Amount | None = None
+    """Where the last step is then: its load or displacement, as in the data; by default the end of the path"""
+    noise: Amount
+    """Standard deviation of such a measurement"""
+
+
+class IdentifySection(Section):
+    """What `magshell identify` looks for; every other command takes the case without it.
+
+    Each column of the data is a result of the case with its unit: `middle_uz [mm]` or `middle_uz_mm`. One column is
+    what the last step prescribes, its load or displacement (`applied [mT]`, `w [mm]`); without it all is read where the
+    path ends. Columns with the name of a key (`magnetic.applied.flux_density [mT]`) change the case from row to row.
+    """
+
+    parameters: Annotated[dict[str, ParameterSection], Field(min_length=1)]
+    """Key of the case with a number (`shell.youngs_modulus`, `magnetic.remanent.flux_density`) -> what is known of it:
+    `{}`, or `{prior: 4.2 MPa, deviation: 0.2 MPa}`. It starts where the case has it"""
+    noise: dict[str, Amount] = Field(default_factory=dict)
+    """Column of the data -> standard deviation of its noise; by default estimated from the residuals"""
+    changes: list[str] = Field(default_factory=list)
+    """Columns of the data that are measured from the begin of the last step on"""
+    candidates: list[CandidateSection] = Field(default_factory=list)
+    """Results to predict, of which one may be measured next"""
+    narrow: str | None = None
+    """The parameter that the next measurement should narrow; by default the one with the largest relative deviation"""
+    steps: int = Field(default=20, ge=1, le=1000)
+    """At most so many steps of Gauss-Newton"""
+
+    @model_validator(mode="after")
+    def _narrowed_one_is_looked_for(self) -> Self:
+        if self.narrow is not None and self.narrow not in self.parameters:
+            raise ValueError(f"narrow: {self.narrow}: is none of the parameters: {', '.join(self.parameters)}")
+        return self

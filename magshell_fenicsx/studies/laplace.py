@@ -1,0 +1,251 @@
+"""Parameters from measured numbers: Gauss-Newton on exact slopes, the posterior by Laplace, what to measure next.
+
+With data d, their noise s and priors m +- t, the fit is least in
+
+    F(x) = sum ((d - y(x))/s)^2 + sum ((x - m)/t)^2,
+
+and the posterior near it is normal with the covariance C = (J^T J/s^2 + 1/t^2)^-1, J = dy/dx (A. Tarantola, Inverse
+Problem Theory, SIAM 2005, section 3.2). Where s is estimated, from the residuals of a column over its degrees of
+freedom, quantiles are those of Student's t. Knows no shell.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Model = Callable[[Array], tuple[Array, Array] | None]  # x (p,) -> y (n,) and J (n, p); None where there is none
+
+CONVERGED = 1e-3  # a step below this part of a standard deviation is the last one
+HALVINGS = 10
+APART = 1e-6  # a smaller singular value, over the largest, is a combination that data do not see
+NAMED = 0.1  # parts of a direction that are named
+RIGHT = 0.95  # of the bands
+AWAY = 2.0  # standard deviations at which the misfit is compared with its parabola
+LEAST = 1.0  # degree of freedom
+EXACT = 1e-12  # no estimated noise is less than this part of the data
+NORMAL = 0.25  # its relative difference there up to which the posterior counts as normal
+
+
+class NotSeen(ValueError):
+    """Data and priors leave a combination of parameters open, those with these numbers."""
+
+    def __init__(self, numbers: NDArray[np.int64]) -> None:
+        self.numbers = [int(number) for number in numbers]
+        super().__init__(f"parameters {self.numbers} are not determined")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is known.
+
+    Attributes
+    ----------
+    data
+        (n,) measured numbers.
+    group
+        (n,) number of the column of each.
+    noise
+        Of each column the standard deviation; nan where it is to be estimated.
+    mean, deviation
+        (p,) of the priors; a deviation is infinite where there is none.
+    """
+
+    data: Array
+    group: NDArray[np.int64]
+    noise: Array
+    mean: Array
+    deviation: Array
+
+    @property
+    def weight(self) -> Array:
+        """(p,) one over the deviations of the priors; zero without one."""
+        return np.asarray(1 / self.deviation)
+
+    def rows(self, y: Array, J: Array, x: Array, noise: Array) -> tuple[Array, Array]:
+        """Residuals and slopes over their deviations, data first."""
+        s, w = noise[self.group], self.weight
+        rest = np.concatenate([(self.data - y) / s, np.where(w > 0, (self.mean - x) * w, 0.0)])
+        return rest, np.vstack([J / s[:, None], np.diag(w)])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The parameters that fit best.
+
+    Attributes
+    ----------
+    x, y, slopes
+        The parameters (p,), what is predicted there (n,), and its derivatives (n, p).
+    noise, freedom
+        Of each column: standard deviation, and degrees of freedom that it is estimated from (infinite if it is given).
+    covariance
+        (p, p) of the posterior.
+    steps
+        Of Gauss-Newton.
+    ended
+        Why it ended.
+    """
+
+    x: Array
+    y: Array
+    slopes: Array
+    noise: Array
+    freedom: Array
+    covariance: Array
+    misfit: float
+    steps: int
+    ended: str
+
+    @property
+    def deviation(self) -> Array:
+        """(p,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> Array:
+        """(p, p)."""
+        return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
+
+    @cached_property
+    def quantile(self) -> float:
+        """Half the width of a 95 % band over a standard deviation."""
+        freedom = float(self.freedom.min())
+        law = scipy.stats.norm if np.isinf(freedom) else scipy.stats.t(freedom)
+        return float(law.ppf((1 + RIGHT) / 2))
+
+    @property
+    def band(self) -> tuple[Array, Array]:
+        """The 95 % bands of the parameters."""
+        half = self.quantile * self.deviation
+        return self.x - half, self.x + half
+
+    def spread(self, slopes: Array) -> Array:
+        """(k,) standard deviations of numbers with these slopes (k, p), without noise."""
+        return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", slopes, self.covariance, slopes)))
+
+    def narrowed(self, slope: Array, noise: float) -> Array:
+        """(p,) standard deviations after one more measurement of a number with this slope (p,) and noise."""
+        g = self.covariance @ slope
+        gain = noise**2 + slope @ g
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance) - (g**2 / gain if gain > 0 else 0.0), 0.0)))
+
+
+def fitted(
+    model: Model, known: Measured, start: Array, size: Array, most: int, told: Callable[[int, Array, float], None]
+) -> Fit:
+    """The fit by Gauss-Newton; steps are halved until the misfit falls.
+
+    Parameters
+    ----------
+    start, size
+        Where it starts (p,), and what a change of each parameter is small against.
+    most
+        Steps.
+    told
+        Called with the number of each step, its parameters and the misfit over the number of data.
+
+    Raises
+    ------
+    NotSeen
+        If data and priors leave a combination of parameters open.
+    """
+    first = model(start)
+    assert first, "there is a prediction at the start"
+    x, (y, J) = np.array(start), first
+    noise, freedom = _estimated(known, y, J, _guessed(known, y), size)
+    ended = f"{most} steps"
+    for step in range(most + 1):
+        rest, A = known.rows(y, J, x, noise)
+        _refuse_unseen(A * size)
+        misfit = float(rest @ rest)
+        told(step, x, misfit / len(known.data))
+        if step == most:
+            break
+        dx = size * np.linalg.lstsq(A * size, rest, rcond=None)[0]
+        covariance = _covariance(A, size)
+        deviation = np.sqrt(np.diag(covariance))
+        if (np.abs(dx) < CONVERGED * deviation).all():
+            ended = "converged"
+            break
+        for halved in range(HALVINGS):
+            tried = x + dx / 2**halved
+            there = model(tried)
+            if there is not None:
+                after = known.rows(*there, tried, noise)[0]
+                if after @ after < misfit:
+                    break
+        else:
+            ended = "no step lowers the misfit"
+            break
+        x, (y, J) = tried, there
+        noise, freedom = _estimated(known, y, J, noise, size)
+    covariance = _covariance(known.rows(y, J, x, noise)[1], size)
+    return Fit(x, y, J, noise, freedom, covariance, misfit, step, ended)
+
+
+def _covariance(A: Array, size: Array) -> Array:
+    _, s, V = np.linalg.svd(A * size, full_matrices=False)
+    half = size[:, None] * V.T / s
+    return np.asarray(half @ half.T)
+
+
+def _refuse_unseen(A: Array) -> None:
+    """See that every combination of parameters changes something."""
+    length = np.linalg.norm(A, axis=0)
+    if (idle := np.flatnonzero(length == 0)).size:
+        raise NotSeen(idle)
+    _, s, V = np.linalg.svd(A / length, full_matrices=False)
+    if len(s) < A.shape[1] or s[-1] < APART * s[0]:
+        raise NotSeen(np.flatnonzero(np.abs(V[-1]) > NAMED))
+
+
+def _guessed(known: Measured, y: Array) -> Array:
+    """The noise of the columns; where it is to be estimated, the root mean square of the residuals."""
+    noise = np.array(known.noise)
+    for column in np.flatnonzero(np.isnan(noise)):
+        noise[column] = np.sqrt(np.mean((known.data - y)[known.group == column] ** 2)) or 1.0
+    return noise
+
+
+def _estimated(known: Measured, y: Array, J: Array, noise: Array, size: Array) -> tuple[Array, Array]:
+    """The noise of the columns, and the degrees of freedom of those that are estimated.
+
+    A number takes as many degrees as its share in the parameters, the diagonal of J C J^T/s^2.
+    """
+    found, freedom, s = np.array(known.noise), np.full(len(noise), np.inf), noise[known.group]
+    C = _covariance(np.vstack([J / s[:, None], np.diag(known.weight)]), size)
+    share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
+    for column in np.flatnonzero(np.isnan(known.noise)):
+        own = known.group == column
+        freedom[column] = max(own.sum() - share[own].sum(), LEAST)
+        found[column] = max(
+            np.sqrt(((known.data - y)[own] ** 2).sum() / freedom[column]), EXACT * np.abs(known.data).max()
+        )
+    return found, freedom
+
+
+def nonlinearity(model: Model, known: Measured, fit: Fit) -> tuple[float, int]:
+    """The largest relative difference of the misfit from its parabola, two deviations along each principal axis.
+
+    Returns
+    -------
+    It, and at how many of these places nothing is predicted.
+    """
+    size = fit.deviation
+    spread, axes = np.linalg.eigh(fit.correlation)
+    worst, lost = 0.0, 0
+    for s, axis in zip(spread, axes.T, strict=True):
+        for way in (-AWAY, AWAY):
+            x = fit.x + way * size * np.sqrt(max(s, 0.0)) * axis
+            there = model(x)
+            if there is None:
+                lost += 1
+                continue
+            rest = known.rows(*there, x, fit.noise)[0]
+            worst = max(worst, abs(float(rest @ rest - fit.misfit) / AWAY**2 - 1))
+    return worst, lost

@@ -1,0 +1,239 @@
+"""Parameters from measured data: what was put in is found, bands cover it; resume, ranks, and what is refused."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell, started
+from conftest import CAP, STRIP
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+import magshell_fenicsx as ms
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.simulate.readings import Reading, read
+from magshell_fenicsx.studies.laplace import Measured, fitted
+
+Array = NDArray[np.float64]
+LOOKED_FOR = """
+identify:
+  parameters: {shell.youngs_modulus: {}, magnetic.remanent.polar: {}}
+  candidates:
+    - {of: tip_ux_mm, at: 20 mT, noise: 0.05 mm}
+    - {of: tip_uz_mm, at: 1 mT, noise: 0.05 mm}
+"""
+KEYS = ("shell.youngs_modulus", "magnetic.remanent.polar")
+TRUTH = np.array([900.0, 80.0])  # kPa, degrees
+FIELDS = (3.0, 7.0, 11.0, 15.0, 19.0)  # mT
+NOISE = 0.05  # mm
+
+
+def case_file(folder: Path, text: str = STRIP + LOOKED_FOR) -> Path:
+    file = folder / "strip.yaml"
+    file.write_text(text)
+    return file
+
+
+def data_file(folder: Path, text: str) -> Path:
+    file = folder / "measured.csv"
+    file.write_text(text)
+    return file
+
+
+def readings() -> list[Reading]:
+    return [Reading(of, at) for at in FIELDS for of in ("tip_ux_mm", "tip_uz_mm")]
+
+
+def synthetic(folder: Path, seed: int = 1) -> Path:
+    """What the case itself gives, with noise; the heights in micrometres."""
+    exact = read(ms.Scene(ms.Case.load(case_file(folder))), readings(), []).values
+    noisy = (exact + NOISE * np.random.default_rng(seed).normal(size=exact.size)).reshape(-1, 2)
+    rows = [f"{b},{x!r},{1e3 * z!r}" for b, (x, z) in zip(FIELDS, noisy.tolist(), strict=True)]
+    return data_file(folder, "\n".join(["applied [mT],tip_ux [mm],tip_uz [um]", *rows]) + "\n")
+
+
+ELSEWHERE = ["shell.youngs_modulus=1000 kPa", "magnetic.remanent.polar=70"]  # where the fit starts
+
+
+def test_what_was_put_in_is_found(tmp_path: Path) -> None:
+    """Within three deviations; the columns estimate the noise that was added; the folder has what is said."""
+    file, data, out = case_file(tmp_path), synthetic(tmp_path), tmp_path / "out"
+    settings = [word for setting in ELSEWHERE for word in ("--set", setting)]
+    done = magshell("identify", file, "--data", data, *settings, "--out", out)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((out / "identify.json").read_text())
+    found = [content["parameters"][key] for key in KEYS]
+    away = [(each["value"] - truth) / each["deviation"] for each, truth in zip(found, TRUTH, strict=True)]
+    assert np.abs(away).max() < 3
+    assert [each["unit"] for each in found] == ["kPa", ""]
+    assert [content["noise"][of]["estimated"] for of in ("tip_ux", "tip_uz")] == [True, True]
+    assert content["noise"]["tip_uz"]["deviation"] == pytest.approx(NOISE, rel=0.8)  # of four degrees of freedom
+    assert content["next"]["result"] == "tip_ux_mm"  # 20 mT bend it most
+    assert (out / "identify.png").stat().st_size > 10_000
+    rows = (out / "identify.csv").read_text().splitlines()
+    assert len(rows) == 1 + 2 * len(FIELDS)
+    assert "next: tip_ux_mm at 20 narrows" in done.stdout
+    assert "shell.youngs_modulus = 9" in done.stdout or "shell.youngs_modulus = 8" in done.stdout
+
+
+class Killed(Exception):
+    pass
+
+
+def test_an_interrupted_identification_goes_on(tmp_path: Path) -> None:
+    """The same numbers, and no evaluation twice."""
+    file, data = case_file(tmp_path), synthetic(tmp_path)
+    said: list[str] = []
+
+    def killed(line: str) -> None:
+        said.append(line)
+        if len(said) == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        ms.identify(file, data, ELSEWHERE, tmp_path / "out", say=killed)
+    kept = {each: each.stat().st_mtime_ns for each in (tmp_path / "out" / "points").glob("*.json")}
+    assert len(kept) >= 2
+    again = ms.identify(file, data, ELSEWHERE, tmp_path / "out")
+    assert {each: each.stat().st_mtime_ns for each in kept} == kept
+    whole = ms.identify(file, data, ELSEWHERE, tmp_path / "whole")
+    assert again.parameters == whole.parameters
+    assert again.content["evaluations"] == whole.content["evaluations"] - len(kept)
+
+
+@pytest.mark.slow
+def test_ranks(tmp_path: Path) -> None:
+    """The same on two ranks, to what sums in another order change."""
+    file, data = case_file(tmp_path), synthetic(tmp_path)
+    one = ms.identify(file, data, ELSEWHERE, tmp_path / "one")
+    words = [word for setting in ELSEWHERE for word in ("--set", setting)]
+    done = started("identify", file, "--data", data, *words, "--out", tmp_path / "two", ranks=2)
+    assert done.returncode == 0, done.stderr
+    two = json.loads((tmp_path / "two" / "identify.json").read_text())["parameters"]
+    for key in KEYS:
+        assert two[key]["value"] == pytest.approx(one.parameters[key]["value"], rel=1e-6)
+        assert two[key]["deviation"] == pytest.approx(one.parameters[key]["deviation"], rel=1e-5)
+
+
+def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
+    """Buckling pressures in three fields say modulus and remanence of a cap, without noise exactly."""
+    text = CAP + "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
+    text = text.replace("parameters:", "noise: {buckling_pressure_Pa: 0.5 Pa}, parameters:")
+    file, key = case_file(tmp_path, text), "magnetic.applied.flux_density"
+    rows = [f"{key} [mT],buckling_pressure [Pa]"]
+    for field in (-10, 5, 20):
+        case = ms.Case.load(file, [f"{key}={field} mT"])
+        rows.append(f"{field},{float(read(ms.Scene(case), [Reading('buckling_pressure_Pa')], []).values[0])!r}")
+    start = ["shell.youngs_modulus=1.4 MPa", "magnetic.remanent.flux_density=50 mT"]
+    found = ms.identify(file, data_file(tmp_path, "\n".join(rows)), start, tmp_path / "out")
+    assert found.fit.x == pytest.approx([1.3, 60.0], rel=1e-4)
+    assert found.content["rows"][2]["settings"] == f"{key}=20.0 mT"
+
+
+class Interpolated:
+    """Predictions of the strip by Chebyshev polynomials in both parameters, from runs at their points."""
+
+    LOW, HIGH, DEGREE = np.array([820.0, 76.0]), np.array([980.0, 84.0]), 4
+
+    def __init__(self, folder: Path) -> None:
+        self.case = ms.Case.load(case_file(folder))
+        nodes = np.cos((np.arange(self.DEGREE + 1) + 0.5) * np.pi / (self.DEGREE + 1))
+        at = list(itertools.product(nodes, nodes))
+        values = np.array([self.exact(self.LOW + (np.array(z) + 1) / 2 * (self.HIGH - self.LOW)) for z in at])
+        self._c = np.linalg.solve(chebyshev.chebvander2d(*np.array(at).T, [self.DEGREE] * 2), values)
+        self._c = self._c.reshape(self.DEGREE + 1, self.DEGREE + 1, -1)
+
+    def exact(self, x: Array) -> Array:
+        changed = {KEYS[0]: float(1e3 * x[0]), KEYS[1]: float(x[1])}
+        return read(ms.Scene(self.case.problem().again(changed)), readings(), []).values
+
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        scale = 2 / (self.HIGH - self.LOW)
+        z = (np.asarray(x) - self.LOW) * scale - 1
+        by = [chebyshev.chebval2d(*z, scale[i] * chebyshev.chebder(self._c, axis=i)) for i in range(2)]
+        return chebyshev.chebval2d(*z, self._c), np.stack(by, axis=1)
+
+
+@pytest.mark.slow
+def test_bands_of_200_repeats_and_metropolis(tmp_path: Path) -> None:
+    """Of 200 synthetic measurements 92 to 98 % of the bands cover the truth; one posterior as Metropolis has it, 5 %.
+
+    Runs are interpolated; the interpolation is 1e-4 of the noise, its slopes are those of the adjoints.
+    """
+    model = Interpolated(tmp_path)
+    beside = np.array([871.0, 81.7])
+    assert model(beside)[0] == pytest.approx(model.exact(beside), abs=1e-4 * NOISE)
+    scene = ms.Scene(model.case)
+    slopes = read(scene, readings(), KEYS).slopes * [1e3, 1.0]
+    assert model(TRUTH)[1] == pytest.approx(slopes, rel=1e-3, abs=1e-6)
+    y, group = model(TRUTH)[0], np.tile([0, 1], len(FIELDS))
+    rng, inside, fits = np.random.default_rng(7), list[Array](), list[Array]()
+    for _ in range(200):
+        known = Measured(y + NOISE * rng.normal(size=y.size), group, np.full(2, NOISE), TRUTH, np.full(2, np.inf))
+        fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
+        inside.append((fit.band[0] < TRUTH) & (fit.band[1] > TRUTH))
+        fits.append(fit.x)
+    cover = np.mean(inside, axis=0)
+    assert (cover >= 0.92).all()
+    assert (cover <= 0.98).all()
+    bias = (np.mean(fits, axis=0) - TRUTH) / (np.std(fits, axis=0) / np.sqrt(200))
+    assert np.abs(bias).max() < 3
+    samples, x, step = [], np.array(fit.x), 1.7 * np.linalg.cholesky(fit.covariance)
+    misfit = lambda x: float(np.sum(((known.data - model(x)[0]) / NOISE) ** 2))  # noqa: E731
+    now = misfit(x)
+    for _ in range(40_000):
+        tried = x + step @ rng.normal(size=2)
+        if np.log(rng.random()) < (now - (then := misfit(tried))) / 2:
+            x, now = tried, then
+        samples.append(x)
+    assert (np.abs(np.mean(samples, axis=0) - fit.x) < 0.05 * fit.deviation).all()
+    assert np.std(samples, axis=0) == pytest.approx(fit.deviation, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "said"),
+    [
+        ("applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n", [], "applied_mT = 30 is outside the path, which goes from 0"),
+        ("applied [mT],tip_uz\n5,9\n", [], r"tip_uz: has no unit: write tip_uz \[mm\]"),
+        ("applied [mT],tip_uz [s]\n5,9\n", [], "column tip_uz: its unit s"),
+        ("applied [mT],tip_uz [mm]\n5,9\n", [], "1 data do not determine 2 parameters without a prior"),
+        ("applied [mT],tip_uz [mm]\n5,9\n10,12\n", [], "2 data do not say the noise beside 2 parameters"),
+        ("applied [mT],middle [mm]\n5,9\n", [], "middle: has the unit mm, but no result of this name has one"),
+        ("applied [mT],speed\n5,9\n", [], "speed: has no gradient here; allowed are"),
+        ("applied [mT]\n5\n9\n", [], "has no column with a result of this case"),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n10,12\n15,13\n",
+            ["identify.parameters={shell.youngs_modulus: {}, shell.density: {}}", "shell.density=1000 kg/m^3"],
+            "shell.density: has no influence on these data",
+        ),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n10,12\n15,13\n",
+            ["identify.parameters={shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}"],
+            "shell.youngs_modulus and magnetic.remanent.flux_density cannot be told apart by these data",
+        ),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            ["identify.parameters={shell.youngs_modulus: {prior: 900, deviation: 10 kPa}}"],
+            "900: the case gives shell.youngs_modulus with the unit kPa: so has its prior",
+        ),
+        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.noise={tip_ux: 1 mm}"], "tip_ux: .*has no such column"),
+        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.noise={tip_uz: 1}"], "needs a unit, such as 1 mm"),
+        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.narrow=shell.thickness"], "is none of the parameters"),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            ["identify.parameters={mesh.size: {}}"],
+            "identify.parameters.mesh.size: mesh.size: is no number that the case gives",
+        ),
+        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify=null"], "identify: is missing"),
+        (
+            "shell.youngs_modulus [kPa],applied [mT],tip_uz [mm]\n900,5,9\n900,10,12\n900,15,13\n",
+            [],
+            "shell.youngs_modulus: is a column of the data, so it is known",
+        ),
+    ],
+)
+def test_what_identifies_nothing(tmp_path: Path, data: str, settings: list[str], said: str) -> None:
+    with pytest.raises(CaseError, match=said):
+        ms.identify(case_file(tmp_path), data_file(tmp_path, data), settings, tmp_path / "out")
