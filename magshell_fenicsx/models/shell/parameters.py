@@ -19,6 +19,7 @@ from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.natural.shape import Natural
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.magnetism.interaction import Interaction
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
 
 
@@ -234,6 +235,8 @@ class Loads:
         What is magnetised where no field is applied: it loads nothing, and is drawn.
     sensors
         Where its magnetic field is read.
+    interaction
+        How strongly its magnetised parts act on each other; None if they do not.
     """
 
     pressure: bool = False
@@ -247,6 +250,7 @@ class Loads:
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: Magnetisation | None = None
     sensors: tuple["Sensor", ...] = ()
+    interaction: "Interaction | None" = None
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:
