@@ -57,6 +57,11 @@ OF_TYPES = {
     "parts/seen.py",
     "parts/supports/reacting.py",
     "parts/supports/reactions.py",
+    "parts/magnetism/interacting.py",
+}
+    "parts/seen.py",
+    "parts/supports/reacting.py",
+    "parts/supports/reactions.py",
 }  # what is observed, of which they know no more than the type
 
 

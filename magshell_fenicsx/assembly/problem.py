@@ -21,6 +21,7 @@ from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
+from magshell_fenicsx.assembly.whole import WholeMatrix, WholeTerm
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.platform import compat
@@ -96,6 +97,8 @@ class FiniteElementSystem:
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
+        self._coupled = [t for t in terms if isinstance(t, WholeTerm)]
+        self._whole = WholeMatrix(V, clamped) if self._coupled else None
         self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
         for term in self._own_residual:
             term.compile_residual()
@@ -255,7 +258,8 @@ class FiniteElementSystem:
     def _times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
         """This rank's part of the tangent without supports times a vector, both with ghosts."""
         if self._assembler:
-            return self._assembler.times(v, factors)
+            found = self._assembler.times(v, factors)
+            return found + self._whole.times(self._among(factors), v) if self._whole else found
         K = self._of_forms(self._unheld, factors, [])
         given, found = K.createVecRight(), np.zeros_like(v)
         given.array[:] = v[: self.size]
@@ -270,12 +274,18 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
+        if self._whole:
+            K = self._whole.sum(K, self._among(factors))
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
         N = self._skew(factors)
         return Skewed(K, N) if N else K
+
+    def _among(self, factors: Mapping[str, float]) -> list[tuple[float, WholeTerm]]:
+        """The terms that couple all unknowns, with their factors."""
+        return [(factor, t) for t in self._coupled if (factor := factors.get(t.name, 0.0))]
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""

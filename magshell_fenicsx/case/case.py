@@ -155,7 +155,7 @@ class Case(WithParts):
             raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
         if self.sensors and "symmetry" in self.boundary.conditions().values():
             raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
-        if self.magnetic and self.magnetic.without_field and not self.sensors:
+        if self.magnetic and self.magnetic.without_field and not self.sensors and self.magnetic.interaction == "none":
             raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.magnetic and self.magnetic.energy != "full" and self.shell.law != "koiter":
             raise ValueError(

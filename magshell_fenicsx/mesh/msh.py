@@ -39,12 +39,12 @@ TIE = 1e-6  # of the area: a difference that decides nothing
 
 
 def oriented(nodes: Array, cells: Cells) -> Cells:
-    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area, or of a rule where there is none.
+    """The triangles (m, 3 | 6 | 10) of each piece in one orientation, that of its larger area, or of a rule.
 
     Raises
     ------
     MeshError
-        If a triangle has no area, an edge has more than two triangles, or the surface has one side or several pieces.
+        If a triangle has no area, an edge has more than two triangles, or the surface has one side or is torn.
     """
     a, b, c = (nodes[cells[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
@@ -72,12 +72,13 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
         raise MeshError(
             f"the surface has only one side: its normals cannot agree across the edge around {place_text(place)}"
         )
-    as_first = copy[:m] == copy[0]
-    elsewhere = np.flatnonzero(~as_first & (copy[m:] != copy[0]))
-    if len(elsewhere):
-        raise MeshError(_torn(nodes, cells, int(elsewhere[0])))
-    if _other_side(nodes, cells, areas, as_first):
-        as_first = ~as_first
+    _refuse_torn(nodes, cells, copy[:m])
+    as_first = np.empty(m, dtype=bool)
+    pieces = np.minimum(copy[:m], copy[m:])
+    for piece in np.unique(pieces):
+        of = np.flatnonzero(pieces == piece)
+        same = copy[of] == copy[of[0]]
+        as_first[of] = ~same if _other_side(nodes, cells[of], areas[of], same) else same
     return np.where(as_first[:, None], cells, cells[:, TURNED[cells.shape[1]]])
 
 
@@ -90,7 +91,7 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     same, whole = areas[as_first].sum(), areas.sum()
     if abs(2 * same - whole) > TIE * whole:
         return bool(2 * same < whole)
-    a, b, c = (nodes[cells[:, i]] - nodes.mean(axis=0) for i in range(3))
+    a, b, c = (nodes[cells[:, i]] - nodes[np.unique(cells)].mean(axis=0) for i in range(3))
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
     outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
     for along in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
@@ -99,16 +100,17 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     return False
 
 
-def _torn(nodes: Array, cells: Cells, apart: int) -> str:
-    place = nodes[cells[apart, 0]]
+def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32]) -> None:
+    """See that pieces which are not connected lie apart."""
+    if (copy == copy[0]).all():
+        return
     vertices = np.unique(cells[:, :3])
     near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
         SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
     )
     if len(near):
-        place = nodes[vertices[near[0, 0]]]
-        return f"the surface is torn: there are two nodes at {place_text(place)}, and its parts are not connected"
-    return f"the surface is in several pieces; one is at {place_text(place)}"
+        place = place_text(nodes[vertices[near[0, 0]]])
+        raise MeshError(f"the surface is torn: there are two nodes at {place}, and its parts are not connected")
 
 
 def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict[str, Cells]:

@@ -7,6 +7,7 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
 from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.magnetism.interaction import Interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.natural.shape import Natural
@@ -26,6 +27,8 @@ class Loads:
         What is magnetised where no field is applied: it loads nothing, and is drawn.
     sensors
         Where its magnetic field is read.
+    interaction
+        How strongly its magnetised parts act on each other; None if they do not.
     """
 
     pressure: bool = False
@@ -39,6 +42,7 @@ class Loads:
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: Magnetisation | None = None
     sensors: tuple[Sensor, ...] = ()
+    interaction: Interaction | None = None
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

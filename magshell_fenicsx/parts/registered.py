@@ -25,6 +25,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     # kind -> module here and class in it
     "pressure": "pressure.pressure.PressureSection",
     "indentation": "forces.indentation.IndentationSection",
+    "interaction": "magnetism.interaction.InteractionStep",
     "field": "magnetism.field_step.FieldSection",
     "rotation": "magnetism.field_step.RotationSection",
     "natural": "natural.section.GrowthSection",
@@ -36,7 +37,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "time": "motion.step.TimeSection",
     "spin": "spin.SpinStep",
 }
-FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
+FIRST = ("natural", "interaction", "field")  # the kinds of steps that may come before the one load, in their order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
@@ -46,6 +47,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "supports.reacting.Moved",
     "magnetism.source_step.SourcesSeen",
     "magnetism.readings.SoftSeen",
+    "magnetism.interaction.InteractionSeen",
     "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
 )

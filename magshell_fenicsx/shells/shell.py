@@ -41,6 +41,7 @@ from magshell_fenicsx.parts.forces.dead_load import (
 )
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
+from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
@@ -203,6 +204,8 @@ class ShellModel(Thin):
             terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
+        if loads.interaction:
+            terms.append(InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]

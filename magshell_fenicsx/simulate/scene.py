@@ -139,7 +139,9 @@ class Scene:
             self.model = build_solid_model(self.problem, comm)
         else:
             self.model = build_model(self.problem, comm)
-        if not (self.problem.fixed or self.model.axisymmetric):
+        surface = self.model.midsurface
+        several = surface is not None and surface.read  # a file may have pieces, of which each must be held
+        if not self.model.axisymmetric and (several or not self.problem.fixed):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches

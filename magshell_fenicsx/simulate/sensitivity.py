@@ -127,7 +127,7 @@ class _Within:
 def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     """mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
     field = scene.model.loads.magnetic
-    if field is None or (field.soft and field.soft.alone):
+    if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
     within, one = scene.problem.within, np.ones(3)
     if not within:

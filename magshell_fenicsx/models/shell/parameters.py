@@ -1,7 +1,7 @@
 """What a shell is made of and what loads it, dimensionless."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,6 @@ from magshell_fenicsx.models.shell.law import Koiter, Law
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.models.shell.rubber import Rubber
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

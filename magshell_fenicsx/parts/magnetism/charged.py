@@ -64,6 +64,15 @@ class Shape:
         slopes = np.stack([np.stack([one, -b], -1), np.stack([0 * one, 1 - a], -1)], -2)
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
+    def thickness(self, cells: Ints, X: Array) -> Array:
+        """The thickness over R and its derivatives by X (.., n, m) at places (n, m, d) of reference cells."""
+        if self.thick is None:
+            found = np.zeros((3, *X.shape[:2]))
+            found[0] = self.h
+            return found
+        element, values = self.thick
+        return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
+
 
 def tables(element: Any, X: Array, order: int) -> Array:
     """(derivatives, n, m, nodes) of an element at places (n, m, d)."""
@@ -113,26 +122,17 @@ class Jets:
             B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
             by_angle = ring * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
             fields = np.stack([turned(each, angle) for each in (B[0], B[1], by_angle)])
-            t = cls._thickness(shape, cells, X)
+            t = shape.thickness(cells, X)
             t = np.stack([t[0], t[1], 0 * t[0]])
             r0, u = jets
             return cls(r0, r0[:3] + u[:3], fields, t, shape, cells, T, TB, angle)
         T, TB = _chain(T, slopes, ab), _chain(TB, slopes, ab)
         r0, u = (np.einsum("dnmk,nki->dnmi", T, each[cells]) for each in (shape.r0, shape.u))
-        t = cls._thickness(shape, cells, X)
+        t = shape.thickness(cells, X)
         if len(t) > 1:
             t = np.concatenate([t[:1], np.einsum("nmad,dnm->anm", slopes, t[1:3])])
         B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
         return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T[:3], TB, angle)
-
-    @staticmethod
-    def _thickness(shape: Shape, cells: Ints, X: Array) -> Array:
-        if shape.thick is None:
-            found = np.zeros((3, *X.shape[:2]))
-            found[0] = shape.h
-            return found
-        element, values = shape.thick
-        return np.asarray(shape.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
         """dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at a height over the thickness."""

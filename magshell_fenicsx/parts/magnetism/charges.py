@@ -238,6 +238,11 @@ class Sides(Family):
         return _found(at, [(eta[..., None], (outward, 0 * outward, 0 * outward))], into)
 
 
+def heights(faces: Faces) -> Array:
+    """The layers of a shell's charges, over the thickness: both faces, and those in it."""
+    return np.array([0.5, -0.5, *(eta for eta, _ in faces._inside)])
+
+
 def _through() -> tuple[Array, Array]:
     """Heights over the thickness and weights."""
     x, w = gauss(LAYERS)

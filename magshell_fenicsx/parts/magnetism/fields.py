@@ -18,7 +18,7 @@ from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Given, Quantity
 from magshell_fenicsx.quantities.registry import register
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -200,6 +200,9 @@ class MagneticSection(Ability):
     """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a number, a formula of
     the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
     flux densities, and always energy: full"""
+    interaction: Literal["none", "others"] = "none"
+    """Whether parts of the shell that are not connected, those of a mesh file, act on each other with their own fields
+    (others), or feel the applied field alone (none). It needs remanent.flux_density and shell.youngs_modulus"""
     remanent: RemanentSection | None = RemanentSection.model_construct()
     """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""
     applied: AppliedSection = AppliedSection.model_construct()
@@ -223,6 +226,24 @@ class MagneticSection(Ability):
             raise ValueError(
                 "susceptibility: beside a remanence lambda_m does not say how strong the field is: give "
                 "remanent.flux_density and applied.flux_density"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _what_acts(self) -> Self:
+        """Parts with a remanence that moves with the material, see `coulomb`."""
+        if self.interaction == "none":
+            return self
+        beside = {
+            "remanent: none": self.remanent is None,
+            "susceptibility": self.susceptibility is not None,
+            "remanence: rotation": self.remanence == "rotation",
+            f"energy: {self.energy}": self.energy != "full",
+        }
+        if bad := next((key for key, there in beside.items() if there), None):
+            raise ValueError(
+                f"interaction: {self.interaction}: not with {bad}: it is that of parts with a remanence alone, with "
+                "remanence: deformation and energy: full"
             )
         return self
 
@@ -283,7 +304,8 @@ class MagneticSection(Ability):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
 
-        return leaves(context, outline) if strength(context) or context.sections.get("sensors") else []
+        acts = [] if self.interaction == "none" else [Leaves("parts act on each other", mirrors=nothing)]
+        return acts + (leaves(context, outline) if strength(context) or context.sections.get("sensors") else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
@@ -300,10 +322,12 @@ class MagneticSection(Ability):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
+        from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
         from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_sensors
         from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
 
         refuse_unfit_sensors(context)
+        refuse_unfit_interaction(context)
         lambda_m = strength(context)
         largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell
         if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:

@@ -24,6 +24,7 @@ from magshell_fenicsx.models.shell.patterns import (
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.sensors import sensors, units
 from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
@@ -194,7 +195,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
-    read = {"sensors": sensors(context, turn)}
+    read = {"sensors": sensors(context, turn), "interaction": interaction(context)}
     if FieldSection.amplitude in driven:
         to = [step.to for step in _rotations(context)]
         return {"magnetic": magnetisation(magnetic, context, turn, within, to), **read}
@@ -213,14 +214,17 @@ def _rotations(context: Context) -> list[RotationSection]:
 
 def account(context: Context, loads: Loads) -> Account:
     """The energy of the field, and its sources."""
-    magnetic, field = context.of(MagneticSection), loads.magnetic
+    magnetic, field, words = context.of(MagneticSection), loads.magnetic, list[str]()
+    if loads.interaction:
+        words = [f"magnetised parts in each other's field, |Br|²/(mu_0 E) = {loads.interaction.strength:g}"]
     if magnetic is None or field is None:
-        return Account(left_out=["magnetic energy: " + ("lambda_m is zero" if magnetic else "no magnetic section")])
+        none = "lambda_m is zero" if magnetic else "no magnetic section"
+        return Account(words, [f"magnetic energy: {none}"])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
     if field.soft:
         chi, beside = magnetic.susceptibility, "without remanence" if field.soft.alone else "beside the remanence"
         chi = f"{chi:g}" if isinstance(chi, int | float) else chi
         law += f", soft magnetism of a sheet with the susceptibility {chi} {beside}"
     sources = enumerate(magnetic.applied.sources or [])
-    words = [f"source {source.name or i}: {source.words()}" for i, source in sources]
+    words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
     return Account([f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words])

@@ -12,12 +12,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.connected import pieces
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.supports.moved import Support
@@ -168,20 +169,29 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:
-    """See that no rigid motion is left free; collective.
+    """See that no rigid motion is left free, of no piece of the shell; collective.
 
     Raises
     ------
     MeshError
         On every rank; the message tells the motion.
     """
+    piece = pieces(r0.function_space)[: system.size // 3]
+    count = 1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX)
+    for number in range(count):
+        _refuse_loose(system, r0, amplitudes, piece == number, whole=count == 1)
+
+
+def _refuse_loose(
+    system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes, own: NDArray[np.bool_], *, whole: bool
+) -> None:
     x = r0.x.array[: system.size].reshape(-1, 3)
-    total = system.comm.allreduce(len(x))
-    centre = system.comm.allreduce(x.sum(axis=0)) / total
+    total = system.comm.allreduce(int(own.sum()))
+    centre = system.comm.allreduce(x[own].sum(axis=0)) / total
     motions = np.zeros((6, *x.shape))
     for i, axis in enumerate(np.eye(3)):
-        motions[i, :, i] = 1.0
-        motions[3 + i] = np.cross(axis, x - centre)
+        motions[i, :, i] = own
+        motions[3 + i] = np.cross(axis, x - centre) * own[:, None]
     rigid = motions.reshape(6, -1)
     stopped = rigid - np.array([system.held(v) for v in rigid])
     _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
@@ -208,6 +218,7 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
                 if moves
                 else "turn"
             )
+            + ("" if whole else f"; this is its piece around {place_text(centre)}, over R")
         )
 
 

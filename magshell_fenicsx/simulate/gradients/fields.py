@@ -38,6 +38,7 @@ from magshell_fenicsx.simulate.transfer import transfer
 
 Array = NDArray[np.float64]
 Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
+OF_CHARGES = ("remanence", "magnitude", "thickness", "deviation")  # of what acts on other parts
 MASS = "mass"
 
 
@@ -73,6 +74,8 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
         raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
+    if scene.problem.loads.interaction and name in OF_CHARGES:
+        raise CaseError(f"{name}: beside magnetic.interaction no result has a gradient by this field")
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
 

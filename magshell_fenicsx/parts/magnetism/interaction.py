@@ -1,0 +1,135 @@
+"""The interaction of magnetised parts as a load: from none to all of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import Field
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.quantities.quantity import Quantity
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.loads import Loads
+
+AMPLITUDE = "interaction"
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """What acts on each other.
+
+    Attributes
+    ----------
+    strength
+        |Br|²/(mu_0 E).
+    """
+
+    strength: float
+
+
+class InteractionStep(PathStep):
+    """What is magnetised begins to act on the other parts of the shell: the factor of their energy grows from 0 to 1.
+
+    The square root of the factor multiplies the remanence in the interaction alone. By default the path is followed by
+    arc length, through its folds.
+    """
+
+    amplitude: ClassVar[str] = AMPLITUDE
+    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(AMPLITUDE, "interaction", "Factor of the energy of magnetised parts in each other's field.", "load"),
+    )
+    kind: Literal["interaction"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    factor: float | None = Field(default=None, ge=0, le=1e3)
+    """Target of the factor; 1 by default, 0 switches the interaction off"""
+
+    @property
+    def _end(self) -> float | None:
+        return 1.0
+
+    @classmethod
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        driven = loading is not None and loading.amplitude == cls.amplitude
+        return [] if driven or not acts(context) else [("magnetic", InteractionBefore(kind="interaction"))]
+
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if not acts(context):
+            raise ValueError(f"{step.key}.kind: interaction needs magnetic.interaction: others")
+
+
+class InteractionBefore(InteractionStep):
+    """The interaction before the one load of a case; it ends at the first instability."""
+
+    def drive(self, now: Now) -> Drive:
+        return Drive("arc", "load", 1.0, [1.0], 0.5, 1.0)
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            return (
+                f"the interaction alone makes the shell unstable at {mu[self.amplitude]:.9g} of it ({what}): to go on, "
+                "take it as a load, kind: interaction"
+            )
+
+        return replace(course, until="limit", forbidden=forbidden)
+
+
+def acts(context: Context) -> bool:
+    """Whether magnetised parts act on each other."""
+    magnetic = context.of(MagneticSection)
+    return magnetic is not None and magnetic.interaction != "none"
+
+
+def interaction(context: Context) -> Interaction | None:
+    """That of a case; None without."""
+    magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
+    if magnetic is None or not acts(context):
+        return None
+    assert magnetic.remanent
+    assert magnetic.remanent.flux_density
+    assert E
+    return Interaction(magnetic.remanent.flux_density**2 / (MU_0 * E))
+
+
+def refuse_unfit_interaction(context: Context) -> None:
+    """See that the shell has what the interaction needs.
+
+    Raises
+    ------
+    CaseError
+        With the key and what is allowed.
+    """
+    magnetic = context.of(MagneticSection)
+    if magnetic is None or not acts(context):
+        return
+    if not (context.shell.youngs_modulus and magnetic.remanent and magnetic.remanent.flux_density):
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: how strong it is follows from remanent.flux_density and "
+            "shell.youngs_modulus: give both"
+        )
+    if context.solid:
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: is of shells, not of a solid: leave out model: solid"
+        )
+    if context.whole and AMPLITUDE not in {step.name for step in context.steps}:
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: no step of the programme drives it: begin loading with a "
+            "step of kind: interaction, or take interaction: none"
+        )
+
+
+class InteractionSeen(Seen):
+    """The factor of the interaction."""
+
+    def named(self, loads: "Loads") -> Sequence[str]:
+        return (AMPLITUDE,) if loads.interaction else ()

@@ -1,0 +1,338 @@
+"""Magnetised parts in each other's field: magpylib's closed forms, differences, and an elastica."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gmsh
+import magpylib
+import numpy as np
+import pytest
+from command import magshell, read_path
+from interrupted import start, wait_for_rows
+from numpy.typing import NDArray
+from scipy.integrate import solve_bvp
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.magnetism import interacting
+from magshell_fenicsx.public import run
+
+Array = NDArray[np.float64]
+MM, MU_0, BR = 1e-3, 4e-7 * np.pi, 0.1
+
+
+def meshed(file: Path, size: float, order: int = 1) -> None:
+    """Write what gmsh's model has, its surfaces part0, part1, ... with edges of the same numbers."""
+    gmsh.model.occ.synchronize()
+    for i, (dim, tag) in enumerate(gmsh.model.getEntities(2)):
+        gmsh.model.addPhysicalGroup(2, [tag], name=f"part{i}")
+        lines = [line for _, line in gmsh.model.getBoundary([(dim, tag)], oriented=False)]
+        gmsh.model.addPhysicalGroup(1, lines, name=f"edge{i}")
+    for word in ("Min", "Max"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{word}", size)
+    gmsh.model.mesh.generate(2)
+    gmsh.model.mesh.setOrder(order)
+    gmsh.write(str(file))
+
+
+@pytest.fixture
+def model() -> Any:
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    yield gmsh.model
+    gmsh.finalize()
+
+
+def discs(file: Path, radius: float, apart: float, size: float) -> None:
+    """Two coaxial discs (mm)."""
+    for z in (0.0, apart):
+        gmsh.model.occ.addDisk(0, 0, z, radius, radius)
+    meshed(file, size, 2)
+
+
+def strips(file: Path, length: float, width: float, apart: float, size: float) -> None:
+    """Two parallel strips along x (mm)."""
+    for z in (0.0, apart):
+        gmsh.model.occ.addRectangle(0, -width / 2, z, length, width)
+    meshed(file, size)
+
+
+def case_of(file: Path, h: float, E: str = "1 MPa", **sections: Any) -> Case:
+    """Two parts, all held, magnetised along e3 (mm)."""
+    data: dict[str, Any] = {
+        "shell": {"geometry": "mesh", "file": str(file), "unit": "mm", "radius": "5 mm"}
+        | {"thickness": f"{h} mm", "youngs_modulus": E, "poisson_ratio": 0},
+        "boundary": {"part0": "clamped", "part1": "clamped"},
+        "magnetic": {"interaction": "others", "remanent": {"polar": 0, "flux_density": f"{BR} T"}},
+        "loading": {"kind": "interaction", "points": 2},
+    }
+    return Case.from_source(Source("test", data | sections))
+
+
+def gradient(scene: Scene, u: Vector) -> Array:
+    """dW/du at all nodes."""
+    system = scene.model.system
+    (term,) = (each for each in system.terms if each.name == "interaction")
+
+    def add() -> Array:
+        b = np.zeros_like(system.u.x.array)
+        term.add_residual(b, 1.0)
+        return b
+
+    return system.at(State(u, {"interaction": 1.0})).of(add)
+
+
+def force(scene: Scene, h: float) -> Array:
+    """That on the upper part (N)."""
+    found = -gradient(scene, scene.model.zero()).reshape(-1, 3)
+    upper = scene.model.r0.x.array.reshape(-1, 3)[:, 2] > 1e-6
+    assert np.abs(found.sum(axis=0)).max() < 1e-12 * np.abs(found).sum(), "actio and reactio"
+    return np.asarray(found[upper].sum(axis=0) * 1e6 * h * MM * 5 * MM)
+
+
+@pytest.mark.parametrize(("gap", "size", "radius"), [(1, 1.2, 2.5), (3, 2.5, 5), (20, 2.5, 5)])
+def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, size: float, radius: float) -> None:
+    """Magpylib's field of one cylinder on the faces of the other, at gaps of 1, 3 and 20 h: 1e-3."""
+    h = 0.2
+    discs(tmp_path / "discs.msh", radius, (gap + 1) * h, size)
+    magnet = magpylib.magnet.Cylinder(polarization=(0, 0, BR), dimension=(2 * radius * MM, h * MM))
+    x, w = np.polynomial.legendre.leggauss(200)
+    t = (1 - x) / 2
+    r, weight = radius * MM * (1 - t**3), radius * MM * 1.5 * w * t**2  # points gather at the rim
+    faces = [magnet.getB(np.column_stack([r, 0 * r, 0 * r + (gap + k) * h * MM]))[:, 2] for k in (0.5, 1.5)]
+    exact = BR / MU_0 * np.sum(2 * np.pi * r * weight * (faces[1] - faces[0]))
+    found = force(Scene(case_of(tmp_path / "discs.msh", h)), h)
+    assert found == pytest.approx([0, 0, exact], rel=1e-3, abs=1e-3 * abs(exact))
+
+
+@pytest.mark.parametrize("gap", [1, 4, 20])
+@pytest.mark.parametrize("along", ["x", "z"])
+def test_force_between_parallel_strips(model: Any, tmp_path: Path, gap: float, along: str) -> None:
+    """Magpylib's cuboid on the charged sides of the other, at gaps of 1, 4 and 20 h: 1e-3."""
+    h, L, w = 0.25, 5.0, 1.0
+    strips(tmp_path / "strips.msh", L, w, (gap + 1) * h, 0.5)
+    polar = {"x": 90, "z": 0}[along]
+    magnetic = {"interaction": "others", "remanent": {"polar": polar, "flux_density": f"{BR} T"}}
+    axis = np.eye(3)["xyz".index(along)]
+    size = np.array([L, w, h]) * MM
+    magnet = magpylib.magnet.Cuboid(polarization=BR * axis, dimension=size, position=(L * MM / 2, 0, 0))
+    x, weight = np.polynomial.legendre.leggauss(40)
+    x = np.sin(np.pi / 2 * x)  # points gather at the edges
+    weight = weight * np.pi / 2 * np.sqrt(1 - x**2)
+    across = [i for i in range(3) if not axis[i]]
+    exact, middle = np.zeros(3), np.array([L / 2, 0, (gap + 1) * h]) * MM
+    a, b = (each.ravel() for each in np.meshgrid(x, x))
+    for side in (1, -1):
+        places = middle + side * axis * size / 2 + np.zeros((len(a), 3))
+        places[:, across[0]] += a * size[across[0]] / 2
+        places[:, across[1]] += b * size[across[1]] / 2
+        area = np.outer(weight, weight).ravel() * size[across[0]] * size[across[1]] / 4
+        exact += side * BR / MU_0 * area @ magnet.getB(places)
+    found = force(Scene(case_of(tmp_path / "strips.msh", h, magnetic=magnetic)), h)
+    assert np.linalg.norm(found - exact) < 1e-3 * np.linalg.norm(exact)
+
+
+@pytest.fixture
+def bent(model: Any, tmp_path: Path) -> tuple[Scene, Vector]:
+    """Two curved magnets, held at their edges, and a displacement of a smooth kind."""
+    strips(tmp_path / "strips.msh", 4.0, 2.0, 1.2, 1.5)
+    held = {"edge0": "clamped", "edge1": "clamped"}
+    given = {"kind": "expression", "components": ["0.6", "0.2", "0.8"], "flux_density": f"{BR} T"}
+    magnetic = {"interaction": "others", "remanent": given}
+    scene = Scene(case_of(tmp_path / "strips.msh", 0.3, boundary=held, magnetic=magnetic, mesh={"degree": 3}))
+    x, y, z = scene.model.r0.x.array.reshape(-1, 3).T
+    u = [0.01 * np.sin(5 * y + z), 0.02 * np.cos(6 * x), 0.03 * np.sin(7 * x + 3 * y + 5 * z)]
+    return scene, scene.model.system.held(np.column_stack(u).ravel()[: scene.model.system.size])
+
+
+def test_derivatives(bent: tuple[Scene, Vector]) -> None:
+    """Forces are the slope of the energy, the tangent is that of the forces, symmetric: differences, 1e-6."""
+    scene, u = bent
+    system, mu = scene.model.system, {"interaction": 1.0}
+    (term,) = (each for each in system.terms if each.name == "interaction")
+    v, step = system.held(np.cos(3.0 * np.arange(system.size))), 1e-4
+    ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
+    moved = [(w / step, u + k * step * v) for k, w in ways]
+    slope = sum(w * system.at(State(each, mu)).of(term.energy) for w, each in moved)
+    assert slope == pytest.approx(gradient(scene, u) @ v, rel=1e-6)
+    rows = system.at(State(u, mu)).of(lambda: system._whole.rows([(1.0, term)])).reshape(system.size, -1)
+    change = sum(w * gradient(scene, each) for w, each in moved)
+    assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
+    assert np.abs(rows - rows.T).max() < 1e-12 * np.abs(rows).max()
+    K, out = system.tangent(u, mu), sum(w * system.residual(each, mu) for w, each in moved)
+    x, y = K.createVecs()
+    x.array[:] = v
+    K.mult(x, y)
+    assert np.linalg.norm(y.array - out) < 1e-6 * np.linalg.norm(out)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0, 1e5])
+def test_inertia(bent: tuple[Scene, Vector], factor: float) -> None:
+    """Negative pivots of the factors are the negative eigenvalues of the dense matrix."""
+    scene, u = bent
+    K = scene.model.system.tangent(0.01 * u, {"interaction": factor})
+    factors = Factorisation(scene.model.system.comm)
+    factors.factor(K)
+    dense = K.getValues(range(scene.model.system.size), range(scene.model.system.size))
+    assert factors.negative_pivots == np.sum(np.linalg.eigvalsh(dense) < 0)
+    assert (factors.negative_pivots > 0) == (factor > 1)
+
+
+def elastica(L: float, w: float, h: float, apart: float, E: float) -> Array:
+    """How the tip of a magnetised cantilever above an equal rigid strip moves, in mm: SciPy, magpylib's cuboid.
+
+    Both are magnetised across. The forces are those on the charged faces, their mean over the width.
+    """
+    magnet = magpylib.magnet.Cuboid(
+        polarization=(0, 0, BR), dimension=(L * MM, w * MM, h * MM), position=(L * MM / 2, 0, 0)
+    )
+    y, weight = np.polynomial.legendre.leggauss(12)
+    stiffness, charge, half = E * w * h**3 / 12 * MM**4, BR / MU_0 * w * MM, h * MM / 2
+
+    def slopes(s: Array, state: Array) -> Array:
+        x, z, angle, moment, Fx, Fz = state
+        n, f, couple = (-np.sin(angle), np.cos(angle)), np.zeros((len(s), 3)), np.zeros(len(s))
+        for side in (1, -1):
+            places = (x + side * half * n[0])[:, None], y * w * MM / 2, (z + side * half * n[1])[:, None]
+            B = magnet.getB(np.stack(np.broadcast_arrays(*places), axis=-1).reshape(-1, 3))
+            on = side * charge * (B.reshape(len(s), -1, 3) * weight[:, None] / 2).sum(axis=1)
+            f += on
+            couple += side * half * (n[0] * on[:, 2] - n[1] * on[:, 0])
+        bend = -(np.cos(angle) * Fz - np.sin(angle) * Fx) - couple
+        return np.array([np.cos(angle), np.sin(angle), moment / stiffness, bend, -f[:, 0], -f[:, 2]])
+
+    def ends(a: Array, b: Array) -> Array:
+        return np.array([a[0], a[1] - apart * MM, a[2], b[3], b[4], b[5]])
+
+    s = np.linspace(0, L * MM, 41)
+    start = np.zeros((6, 41))
+    start[0], start[1] = s, apart * MM
+    found = solve_bvp(slopes, ends, s, start, tol=1e-6)
+    assert found.success
+    return np.array([found.y[0, -1] / MM - L, found.y[1, -1] / MM - apart])
+
+
+def test_strip_above_a_strip(model: Any, tmp_path: Path) -> None:
+    """The elastica in the field of its neighbour, 1e-3; Newton's method is quadratic."""
+    L, w, h, apart = 10.0, 2.0, 0.25, 1.5
+    strips(tmp_path / "strips.msh", L, w, apart, 1.0)
+    root = gmsh.model.getEntitiesInBoundingBox(-0.1, -2, apart - 0.1, 0.1, 2, apart + 0.1, 1)
+    gmsh.model.addPhysicalGroup(1, [root[0][1]], name="root")
+    gmsh.write(str(tmp_path / "strips.msh"))
+    points = {"tip": [f"{L} mm", f"{w / 2} mm", f"{apart} mm"]}
+    case = case_of(
+        tmp_path / "strips.msh", h, "200 MPa", boundary={"part0": "clamped", "root": "clamped"}, points=points
+    )
+    found = run(case)
+    row = found.rows[-1]
+    assert row["interaction"] == 1.0
+    exact = elastica(L, w, h, apart, 200e6)
+    assert np.linalg.norm([row["tip_ux_mm"], row["tip_uz_mm"]] - exact) < 1e-3 * np.linalg.norm(exact)
+    assert exact[1] < -0.2
+    assert row["negative_pivots"] == 0
+    system, mu = found.scene.model.system, {"interaction": 1.0}
+    factors, u, steps = Factorisation(system.comm), np.zeros(system.size), []
+    while not steps or steps[-1] > 1e-11:
+        factors.factor(system.tangent(u, mu))
+        step = factors.solve(-system.residual(u, mu))
+        u += step
+        steps.append(np.abs(step).max())
+        assert len(steps) < 8
+    near = [(a, b) for a, b in pairwise(steps) if a < 1e-5]
+    assert len(near) > 1
+    assert all(b < 2e3 * a**2 for a, b in near), steps
+
+
+CASE = """
+shell:
+  {geometry: mesh, file: strips.msh, unit: mm, radius: 5 mm, thickness: 0.2 mm, youngs_modulus: 20 MPa,
+   poisson_ratio: 0.3}
+boundary: {edge0: clamped, edge1: clamped}
+magnetic: {remanent: {polar: 30, flux_density: 100 mT}, interaction: others}
+loading: {kind: interaction, points: 3}
+mesh: {degree: 2}
+"""
+SAME = ("interaction", "w_over_h", "energy", "magnetic", "bending")
+
+
+def test_ranks_and_resume(model: Any, tmp_path: Path) -> None:
+    """The same path on 1, 2 and 3 ranks, and of a run that goes on from its second point."""
+    strips(tmp_path / "strips.msh", 4.0, 2.0, 1.5, 2.0)
+    (tmp_path / "case.yaml").write_text(CASE)
+    run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
+    wait_for_rows(run, tmp_path / "again", 2)
+    run.terminate()
+    run.communicate()
+    done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / "again", "--resume", ranks=1)
+    assert done.returncode == 0, done.stderr
+    paths = [read_path(tmp_path / "again")]
+    for ranks in (1, 2, 3):
+        done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / str(ranks), ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        paths.append(read_path(tmp_path / str(ranks)))
+    for other in paths[1:]:
+        assert [row["negative_pivots"] for row in other] == [row["negative_pivots"] for row in paths[0]]
+        for name in SAME:
+            first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
+            assert values == pytest.approx(first, rel=1e-7, abs=1e-14), name
+    assert paths[0][-1]["interaction"] == "1.0"
+
+
+def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
+    """There is no such equilibrium, and the energy is no number."""
+    scene, u = bent
+    z = scene.model.r0.x.array.reshape(-1, 3)[:, 2]
+    u.reshape(-1, 3)[:, 2] -= np.where(z > 1e-6, 0.2, 0.0)
+    assert np.isnan(gradient(scene, u)).all()
+
+
+SHELL = {"geometry": "mesh", "unit": "mm", "radius": "5 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
+REMANENT = {"polar": 0, "flux_density": "0.1 T"}
+WRONG = [
+    ({"remanent": None, "susceptibility": 2, "lambda_m": 1e-3}, {}, "not with remanent: none"),
+    ({"remanent": REMANENT, "susceptibility": 2, "applied": REMANENT}, {}, "not with susceptibility"),
+    ({"remanent": REMANENT, "remanence": "rotation", "applied": REMANENT}, {}, "not with remanence: rotation"),
+    ({"remanent": REMANENT, "energy": "first", "applied": REMANENT}, {}, "not with energy: first"),
+    ({"remanent": {"polar": 0}, "lambda_m": 1e-3}, {}, "how strong it is follows from remanent.flux_density"),
+    ({"remanent": REMANENT}, {"loading": [{"kind": "pressure"}]}, "no step of the programme drives it"),
+    ({"remanent": REMANENT}, {"model": "solid"}, "geometry: mesh|is of shells, not of a solid"),
+    ({"remanent": REMANENT}, {}, "the shell is one part"),
+]
+
+
+@pytest.mark.parametrize(("magnetic", "sections", "said"), WRONG)
+def test_bad_input(model: Any, tmp_path: Path, magnetic: dict[str, Any], sections: dict[str, Any], said: str) -> None:
+    gmsh.model.occ.addRectangle(0, 0, 0, 1, 1)
+    meshed(tmp_path / "one.msh", 0.5)
+    data = {
+        "shell": {**SHELL, "file": str(tmp_path / "one.msh"), "poisson_ratio": 0.3},
+        "boundary": {"edge0": "clamped"},
+        "magnetic": {"interaction": "others", **magnetic},
+        "loading": {"kind": "interaction"},
+    }
+    with pytest.raises((CaseError, ValueError), match=said):
+        Scene(Case.from_source(Source("test", data | sections)))
+
+
+def test_a_step_without_interaction_is_refused(model: Any, tmp_path: Path) -> None:
+    strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
+    with pytest.raises(ValueError, match=r"interaction needs magnetic\.interaction: others"):
+        case_of(tmp_path / "strips.msh", 0.1, magnetic={"lambda_m": 1e-3})
+
+
+def test_models_that_are_too_large(model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interacting, "LARGEST", 100)
+    strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
+    with pytest.raises(CaseError, match="as all of them act on each other, at most 100 are allowed"):
+        Scene(case_of(tmp_path / "strips.msh", 0.1))
+
+
+def test_a_piece_that_is_not_held(model: Any, tmp_path: Path) -> None:
+    """Each piece of a mesh needs its own support."""
+    strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
+    with pytest.raises(MeshError, match=r"free to .*; this is its piece around \(0.2, .*, 0.2\)"):
+        Scene(case_of(tmp_path / "strips.msh", 0.1, boundary={"part0": "clamped"}))
