@@ -16,6 +16,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.coupled import Coupled, Entries, times, with_entries
 from magshell_fenicsx.assembly.evaluated import Evaluated, Noise
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
@@ -93,6 +94,7 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
+        self._coupled = [t for t in terms if isinstance(t, Coupled)]
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
@@ -255,12 +257,20 @@ class FiniteElementSystem:
     def _times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
         """This rank's part of the tangent without supports times a vector, both with ghosts."""
         if self._assembler:
-            return self._assembler.times(v, factors)
-        K = self._of_forms(self._unheld, factors, [])
-        given, found = K.createVecRight(), np.zeros_like(v)
-        given.array[:] = v[: self.size]
-        found[: self.size] = (K * given).array
+            found = self._assembler.times(v, factors)
+        else:
+            K = self._of_forms(self._unheld, factors, [])
+            given, found = K.createVecRight(), np.zeros_like(v)
+            given.array[:] = v[: self.size]
+            found[: self.size] = (K * given).array
+        if entries := self._entries(factors):
+            whole = self.comm.allreduce(times(entries, np.concatenate(self.comm.allgather(v[: self.size]))))
+            first = 3 * self.u.function_space.dofmap.index_map.local_range[0]
+            found[: self.size] += whole[first : first + self.size]
         return found
+
+    def _entries(self, factors: Mapping[str, float]) -> list[tuple[float, Entries]]:
+        return [(factor, t.entries()) for t in self._coupled if (factor := factors.get(t.name, 0.0))]
 
     def _tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
@@ -270,6 +280,10 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
+        if entries := self._entries(factors):
+            fixed = np.zeros(self.size, dtype=bool)
+            fixed[self._fixed] = True
+            K = with_entries(K, entries, np.concatenate(self.comm.allgather(fixed)))
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:

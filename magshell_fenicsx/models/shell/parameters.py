@@ -20,6 +20,7 @@ from magshell_fenicsx.parts.natural.shape import Natural
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
+    from magshell_fenicsx.parts.touching.touching import Pair
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,8 @@ class Loads:
         What is magnetised where no field is applied: it loads nothing, and is drawn.
     sensors
         Where its magnetic field is read.
+    pairs
+        What may touch: the shell itself, or parts of it.
     """
 
     pressure: bool = False
@@ -244,6 +247,7 @@ class Loads:
     natural: Natural | None = None
     moves: tuple[Move, ...] = ()
     contacts: tuple[Contact, ...] = ()
+    pairs: tuple["Pair", ...] = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: Magnetisation | None = None
     sensors: tuple["Sensor", ...] = ()

@@ -1,0 +1,424 @@
+"""Contact of a shell with itself or of its parts with each other: the penalty of the gap between their faces.
+
+Each mid-surface has points of a quadrature. The gap of a point x is |x - y| - h with the nearest place y of the other
+mid-surface: the faces are half a thickness from both. Both surfaces have points, so that each has half of the penalty.
+A gap is a function of the state alone, and has no side: see `through` for steps that would pass through.
+
+With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
+
+    d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),   A = F,ab
+
+where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
+Springer 2006, sec. 4.1 and 9.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.parts.bodies.contact import SOFT, penalty
+from magshell_fenicsx.parts.touching.nearest import (
+    BESIDE,
+    BULGE,
+    Cells,
+    Longs,
+    Places,
+    inverse,
+    jets,
+    near_pairs,
+    slopes,
+)
+from magshell_fenicsx.parts.touching.nearest import project as projected
+
+Array = NDArray[np.float64]
+REACH = 4.0  # thicknesses: farther places are not looked for
+MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
+BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
+MANY = 100_000  # pairs of a point and a cell at a time
+CHUNK = 1000  # blocks of a tangent at a time
+SAME = 1e-9  # of the thickness: distances that are equal
+PART = 0.25  # of the thickness: how far points move between two looks at a step
+NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What may touch, dimensionless.
+
+    Attributes
+    ----------
+    names
+        Of both: `shell`, or a patch.
+    suffix
+        What its columns have at their ends.
+    stiffness
+        k of the penalty, over E h/R^2.
+    bound
+        Largest penetration that is allowed, over h.
+    """
+
+    names: tuple[str, str]
+    suffix: str
+    stiffness: float
+    bound: float = 1e-3
+
+    @property
+    def setting(self) -> str:
+        """Name of its stiffness in a state; no name of a user has a space."""
+        return f"stiffness between {self.names[0]} and {self.names[1]}"
+
+    @property
+    def words(self) -> str:
+        """What it is, in messages."""
+        return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
+
+
+@dataclass
+class Number:
+    """A number that a state sets."""
+
+    value: float
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of this rank at which gaps are measured.
+
+    Attributes
+    ----------
+    cell
+        (n,) global number.
+    shape
+        (n, functions) of that cell.
+    weight
+        (n,) undeformed area over R^2.
+    first, local
+        Number of the first cell of this rank, and how many it has with ghosts.
+    """
+
+    cell: Longs
+    shape: Array
+    weight: Array
+    first: int
+    local: int
+
+
+class Touching:
+    """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+
+    Parameters
+    ----------
+    allowed
+        Whether points of cells (n,) may touch cells (n,).
+    h
+        Thickness over R.
+    r0, u
+        All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
+    first, own
+        Number of the first degree of freedom of this rank, and how many it has.
+    """
+
+    amplitude = None
+    column = ""
+
+    def __init__(
+        self,
+        pair: Pair,
+        cells: Cells,
+        points: Points,
+        allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
+        h: float,
+        r0: Array,
+        u: Callable[[], Array],
+        own: tuple[int, int],
+        comm: MPI.Comm,
+    ) -> None:
+        self.pair, self.name = pair, f"contact{pair.suffix}"
+        self.group = self.name
+        self.stiffness = Number(pair.stiffness)
+        self._cells, self._points, self._allowed, self._h = cells, points, allowed, h
+        self._r0, self._u, self._own, self._comm = r0, u, own, comm
+        self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
+        self._places = _none()
+        self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
+
+    # as a term
+
+    @property
+    def history(self) -> tuple[str, tuple[Number, float]]:
+        """See `FiniteElementSystem`."""
+        return self.pair.setting, (self.stiffness, self.pair.stiffness)
+
+    def compile_residual(self) -> None:
+        """It has no forms."""
+
+    def compile_tangent(self) -> None:
+        """It has no forms."""
+
+    def energy(self) -> float:
+        at, (value, _, _) = self._pressed()
+        return float(self._weight(at) @ value)
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        whole = np.zeros(self._r0.shape)
+        at, (_, first, _) = self._pressed()
+        if len(at.point):
+            _, n, beta, nodes = self._geometry(at)
+            forces = -(factor * self._weight(at) * first)[:, None, None] * beta[:, :, None] * n[:, None, :]
+            np.add.at(whole, nodes, forces)
+        if self._comm.size > 1:
+            whole = np.asarray(self._comm.allreduce(whole))
+        start, size = self._own
+        b[:size] += whole.ravel()[start : start + size]
+
+    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
+        """None here: what assembles the others adds `entries`."""
+
+    def entries(self) -> Entries:
+        at, (_, first, second) = self._pressed()
+        number = len(self._cells.nodes)
+        order = np.argsort(self._points.cell[at.point] * number + at.cell, kind="stable")
+        at, first, second = at.of(order), first[order], second[order]
+        keys = self._points.cell[at.point] * number + at.cell
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        rows, columns, values = list[Longs](), list[Longs](), list[Array]()
+        for some in np.array_split(starts, max(1, len(keys) // CHUNK)):
+            if not len(some):
+                continue
+            after = starts[np.searchsorted(starts, some[-1]) + 1 :]
+            part = slice(some[0], after[0] if len(after) else len(keys))
+            H, nodes = self._hessians(at.of(part), first[part], second[part])
+            sums = np.add.reduceat(H, some - some[0], axis=0)
+            dofs = (3 * nodes[some - some[0]][:, :, None] + np.arange(3)).reshape(len(some), -1)
+            i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+            rows.append(i.ravel())
+            columns.append(j.ravel())
+            values.append(sums.ravel())
+        nothing = np.zeros(0, dtype=np.int64)
+        if not rows:
+            return nothing, nothing, np.zeros(0)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    # what is seen
+
+    def force(self) -> float:
+        """The sum of the pressures over the contact, over E h R; collective."""
+        at, (_, first, _) = self._pressed()
+        return float(self._comm.allreduce(float(self._weight(at) @ first)))
+
+    def least_gap(self) -> float:
+        """Over R; nan where no places face each other within the reach; collective."""
+        places = self._found(self._now(), REACH * self._h)
+        least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
+        return least - self._h if np.isfinite(least) else np.nan
+
+    def penetration(self) -> float:
+        """The largest, over R; 0 where nothing touches; collective."""
+        at, _ = self._pressed()
+        return float(self._comm.allreduce(float((self._h - at.distance).max(initial=0.0)), MPI.MAX))
+
+    def deepest(self) -> tuple[float, Array]:
+        """The largest penetration over R, and its place (3,); collective."""
+        at, _ = self._pressed()
+        mine = (0.0, np.zeros(3))
+        if len(at.point):
+            worst = int(at.distance.argmin())
+            x = self._x(self._r0 + self._now())[at.point[worst]]
+            mine = (float(self._h - at.distance[worst]), x)
+        deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
+        return float(deep), np.asarray(place)
+
+    def of_cells(self) -> tuple[Array, Array]:
+        """The mean pressure over E h/R, and the least gap over R within the reach, of local cells.
+
+        Of ghosts the pressure is zero and the gap the reach. Collective.
+        """
+        at, (_, first, _) = self._pressed()
+        points, start = self._points, self._points.first
+        weight, p, gap = np.ones(points.local), np.zeros(points.local), np.full(points.local, (REACH - 1) * self._h)
+        np.add.at(weight, points.cell - start, points.weight)
+        weight[: len(np.unique(points.cell))] -= 1.0
+        np.add.at(p, points.cell[at.point] - start, points.weight[at.point] * first)
+        near = self._found(self._now(), REACH * self._h)
+        np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
+        return p / weight, gap
+
+    def through(self, u: Array, v: Array) -> bool:
+        """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
+
+        Between two looks none moves, relative to another, by more than a part of the thickness.
+        """
+        moved = v - u
+        moved = moved - moved.mean(axis=0)
+        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * self._h)))
+        if not self._near_on_way(u, v):
+            return False
+        for k in range(1, looks):
+            near = self._found(u + k / looks * (v - u), NEARER * self._h)
+            if self._comm.allreduce(len(near.point)):
+                return True
+        return False
+
+    # geometry
+
+    def _now(self) -> Array:
+        return self._u()
+
+    def _x(self, r: Array) -> Array:
+        points = self._points
+        return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
+
+    def _weight(self, at: Places) -> Array:
+        return np.asarray(self._points.weight[at.point] / 2)
+
+    def _pressed(self) -> tuple[Places, tuple[Array, Array, Array]]:
+        """The places that are pressed at the present state, and the penalty with its derivatives by the penetration."""
+        u = self._now()
+        if not np.array_equal(u, self._at):
+            self._places, self._at = self._found(u, self._h), np.array(u)
+        at = self._places
+        return at, penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
+
+    def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
+        """Distances, normals, and beta (n, functions of both cells) with its nodes."""
+        nodes = np.concatenate([self._cells.nodes[self._points.cell[at.point]], self._cells.nodes[at.cell]], axis=1)
+        r = self._r0 + self._at
+        half = nodes.shape[1] // 2
+        N = self._points.shape[at.point]
+        (shape, y), *_ = jets(self._cells.element, at.X, r[nodes[:, half:]], 0)
+        off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
+        d = np.linalg.norm(off, axis=1)
+        return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
+
+    def _hessians(self, at: Places, first: Array, second: Array) -> tuple[Array, Longs]:
+        """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
+        d, n, beta, nodes = self._geometry(at)
+        r, half = self._r0 + self._at, nodes.shape[1] // 2
+        table = list(jets(self._cells.element, at.X, r[nodes[:, half:]]))
+        y = [each for _, each in table]
+        A = slopes(d[:, None] * n, y[1], y[2], y[3], y[4], y[5])[1]
+        M = np.einsum("nik,nkl,njl->nij", at.free, inverse(at.free, A), at.free)
+        along = np.zeros((2, *beta.shape))
+        for a in range(2):
+            along[a, :, half:] = table[1 + a][0]
+        both = [
+            -beta[:, :, None] * y[1 + a][:, None, :] - (d[:, None] * along[a])[:, :, None] * n[:, None, :]
+            for a in range(2)
+        ]
+        C = np.stack(both, axis=1).reshape(len(d), 2, -1)
+        g = (beta[:, :, None] * n[:, None, :]).reshape(len(d), -1)
+        across = np.eye(3) - n[:, :, None] * n[:, None, :]
+        B = beta[:, :, None, None, None] * beta[:, None, None, :, None] * across[:, None, :, None, :]
+        bend = B.reshape(len(d), g.shape[1], g.shape[1]) - np.einsum("nab,nai,nbj->nij", M, C, C, optimize=True)
+        H = second[:, None, None] * g[:, :, None] * g[:, None, :] - (first / d)[:, None, None] * bend
+        return self._weight(at)[:, None, None] * H, nodes
+
+    def _near_on_way(self, u: Array, v: Array) -> bool:
+        """Whether any cells that may touch come near each other between two displacements; collective."""
+        both = [self._spheres(self._r0 + each) for each in (u, v)]
+        centres = (both[0][0] + both[1][0]) / 2
+        apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
+        radii = np.maximum(both[0][1], both[1][1]) + apart
+        near = self._fit(*near_pairs(centres, radii, self._h))
+        return bool(self._comm.allreduce(len(near[0])))
+
+    def _spheres(self, r: Array) -> tuple[Array, Array]:
+        """Centres and radii of spheres around all cells."""
+        nodal = r[self._cells.nodes]
+        centres = nodal.mean(axis=1)
+        return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+
+    def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
+        """The pairs of cells that may touch."""
+        keys = i * len(self._cells.nodes) + j
+        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
+        fits = (self._beside[at] != keys) & self._allowed(i, j)
+        return i[fits], j[fits]
+
+    def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
+        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
+        if reach in self._tracked:
+            then, margin, pairs = self._tracked[reach]
+            moved = 2 * float(np.linalg.norm(u - then, axis=1).max(initial=0.0))
+            if moved + reach <= margin:
+                return pairs
+        centres, radii = self._spheres(self._r0 + u)
+        margin = reach + MARGIN * float(radii.mean())
+        i, j = self._fit(*near_pairs(centres, radii, margin))
+        mine = np.zeros(len(centres), dtype=bool)
+        mine[self._points.cell] = True
+        pairs = i[mine[i]], j[mine[i]]
+        self._tracked[reach] = np.array(u), margin, pairs
+        return pairs
+
+    def _found(self, u: Array, reach: float) -> Places:
+        """The places that points of this rank face at a displacement, within a distance."""
+        i, j = self._near_cells(u, reach)
+        points, cells, r = self._points, self._cells, self._r0 + u
+        x, (centres, radii) = self._x(r), self._spheres(r)
+        count = np.bincount(points.cell, minlength=len(cells.nodes))
+        order = np.argsort(points.cell, kind="stable")
+        firsts = np.concatenate([[0], np.cumsum(count)])
+        n = count[i]
+        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
+        close = np.linalg.norm(x[point] - centres[cell], axis=1) < radii[cell] + reach
+        point, cell = point[close], cell[close]
+        if not len(point):
+            return _none()
+        X, shape = cells.lattice
+        used, which = np.unique(cell, return_inverse=True)
+        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used]])
+        start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
+        for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
+            away = np.linalg.norm(spread[which[some]] - x[point[some], None], axis=2)
+            start[some] = away.argmin(axis=1)
+            least[some] = away[np.arange(len(some)), start[some]]
+        close = least < reach + BETWEEN * radii[cell]
+        point, cell, start = point[close], cell[close], start[close]
+        if not len(point):
+            return _none()
+        at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]))
+        return self._facing(at.of(at.distance < reach), r, x)
+
+    def _facing(self, at: Places, r: Array, x: Array) -> Places:
+        """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
+        has one on each side of its own surface at most."""
+        cells, number = self._cells, len(self._cells.nodes)
+        keys = at.point * number + at.cell
+        order = np.argsort(keys, kind="stable")
+        at, keys = at.of(order), keys[order]
+        on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
+        stays = np.ones(len(keys), dtype=bool)
+        for side in range(3):
+            beyond = cells.across[at.cell, side]
+            asked = on[:, side] & (beyond >= 0)
+            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            known = keys[there] == at.point * number + beyond
+            nearer = at.distance[there] < at.distance - SAME * self._h
+            stays &= ~asked | (known & ~nearer)
+        at = at.of(stays)
+        if not len(at.point):
+            return at
+        points = self._points
+        _, (_, t1), (_, t2) = jets(cells.element, self._reference(at.point), r[cells.nodes[points.cell[at.point]]], 1)
+        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
+        above = np.sum(np.cross(t1, t2) * (x[at.point] - y), axis=1) > 0
+        order = np.lexsort((at.distance, above, at.point))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(at.point[order]) != 0) | (np.diff(above[order].astype(int)) != 0)
+        return at.of(np.sort(order[first]))
+
+    def _reference(self, point: Longs) -> Array:
+        """Places (n, 2) of points in their cells: the shape functions are exact for them."""
+        return np.asarray(self._points.shape[point] @ self._cells.element.points)
+
+
+def _none() -> Places:
+    nothing = np.zeros(0, dtype=np.int64)
+    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
