@@ -39,12 +39,12 @@ TIE = 1e-6  # of the area: a difference that decides nothing
 
 
 def oriented(nodes: Array, cells: Cells) -> Cells:
-    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area, or of a rule where there is none.
+    """The triangles (m, 3 | 6 | 10) of each piece in one orientation: of the larger area, or of a rule where none is.
 
     Raises
     ------
     MeshError
-        If a triangle has no area, an edge has more than two triangles, or the surface has one side or several pieces.
+        If a triangle has no area, an edge has more than two triangles, or the surface has one side, or is torn.
     """
     a, b, c = (nodes[cells[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
@@ -72,13 +72,16 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
         raise MeshError(
             f"the surface has only one side: its normals cannot agree across the edge around {place_text(place)}"
         )
-    as_first = copy[:m] == copy[0]
-    elsewhere = np.flatnonzero(~as_first & (copy[m:] != copy[0]))
-    if len(elsewhere):
-        raise MeshError(_torn(nodes, cells, int(elsewhere[0])))
-    if _other_side(nodes, cells, areas, as_first):
-        as_first = ~as_first
-    return np.where(as_first[:, None], cells, cells[:, TURNED[cells.shape[1]]])
+    pieces = np.minimum(copy[:m], copy[m:])
+    _, firsts = np.unique(pieces, return_index=True)
+    if len(firsts) > 1:
+        _refuse_torn(nodes, cells)
+    kept = np.zeros(m, dtype=bool)
+    for first in firsts:
+        piece = pieces == pieces[first]
+        as_first = copy[:m][piece] == copy[first]
+        kept[piece] = as_first ^ _other_side(nodes, cells[piece], areas[piece], as_first)
+    return np.where(kept[:, None], cells, cells[:, TURNED[cells.shape[1]]])
 
 
 def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
@@ -99,16 +102,15 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     return False
 
 
-def _torn(nodes: Array, cells: Cells, apart: int) -> str:
-    place = nodes[cells[apart, 0]]
+def _refuse_torn(nodes: Array, cells: Cells) -> None:
+    """See that no two vertices of a surface of several pieces are in one place."""
     vertices = np.unique(cells[:, :3])
     near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
         SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
     )
     if len(near):
-        place = nodes[vertices[near[0, 0]]]
-        return f"the surface is torn: there are two nodes at {place_text(place)}, and its parts are not connected"
-    return f"the surface is in several pieces; one is at {place_text(place)}"
+        place = place_text(nodes[vertices[near[0, 0]]])
+        raise MeshError(f"the surface is torn: there are two nodes at {place}, and its parts are not connected")
 
 
 def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict[str, Cells]:

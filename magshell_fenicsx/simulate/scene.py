@@ -139,7 +139,8 @@ class Scene:
             self.model = build_solid_model(self.problem, comm)
         else:
             self.model = build_model(self.problem, comm)
-        if not (self.problem.fixed or self.model.axisymmetric):
+        read = bool(self.model.midsurface and self.model.midsurface.read)  # of several pieces one may be loose
+        if not self.model.axisymmetric and (read or not self.problem.fixed):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches

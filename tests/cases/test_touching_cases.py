@@ -25,7 +25,9 @@ def touching_pressure(gap: float) -> float:
 
     s = np.linspace(0, np.pi / 2, 401)
     bent = 0.05 * np.array([np.sin(2 * s), 2 * np.cos(2 * s)])
-    z = np.stack([np.cos(s), np.sin(s), np.pi / 2 + s + bent[0], 1 + bent[1], -3 * np.sin(s), -3 * np.cos(s), 3 + 0 * s])
+    z = np.stack(
+        [np.cos(s), np.sin(s), np.pi / 2 + s + bent[0], 1 + bent[1], -3 * np.sin(s), -3 * np.cos(s), 3 + 0 * s]
+    )
     for half in np.linspace(0.93, gap / 2, 40):
 
         def ends(a: Array, b: Array, half: float = half) -> Array:

@@ -205,7 +205,6 @@ WRONG = [
         FRAME,
         r"two nodes at \((0, 0|1, 1), 0\), and its parts are not connected",
     ),
-    ([*TWO, [1, 5, 6]], [*CORNERS, [2, 0, 0], [2, -1, 0]], [*FRAME, [1, 5], [5, 6], [6, 1]], "in several pieces"),
     ([[0, 1, 2], [0, 2, 5]], [*CORNERS, [0.5, 0.5, 0]], [[0, 1], [1, 2], [2, 5], [5, 0]], r"\(0, 0, 0\) has no area"),
     (MOEBIUS, STRIP, [], "only one side"),
 ]

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import basix
 import numpy as np
+import scipy
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -167,20 +168,45 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:
-    """See that no rigid motion is left free; collective.
+    """See that no rigid motion is left free, of no piece of the surface; collective.
 
     Raises
     ------
     MeshError
         On every rank; the message tells the motion.
     """
-    x = r0.x.array[: system.size].reshape(-1, 3)
+    x, pieces = r0.x.array[: system.size].reshape(-1, 3), pieces_of(r0.function_space)
+    if several := system.comm.allreduce(int(pieces.max(initial=0)), MPI.MAX):
+        for piece in range(several + 1):
+            _refuse_loose(system, x, pieces == piece, amplitudes, " in one of its pieces")
+        return
+    _refuse_loose(system, x, pieces == 0, amplitudes, "")
+
+
+def pieces_of(V: fem.FunctionSpace) -> NDArray[np.int64]:
+    """The number of the unconnected piece of a surface that each own node is in; collective."""
+    comm, index, count = V.mesh.comm, V.dofmap.index_map, V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+    own = V.dofmap.list[:count]
+    nodes = np.concatenate(comm.allgather(index.local_to_global(own.ravel().astype(np.int32)).reshape(own.shape)))
+    first, others = np.broadcast_arrays(nodes[:, :1], nodes[:, 1:])
+    edges = scipy.sparse.coo_array(
+        (np.ones(others.size, dtype=np.int8), (first.ravel(), others.ravel())), (index.size_global, index.size_global)
+    )
+    labels = scipy.sparse.csgraph.connected_components(edges, directed=False)[1]
+    return np.asarray(labels[slice(*index.local_range)], dtype=np.int64)
+
+
+def _refuse_loose(
+    system: FiniteElementSystem, places: Array, piece: NDArray[np.bool_], amplitudes: Amplitudes, where: str
+) -> None:
+    """See that no rigid motion of a piece is left free, which some of the nodes are in; collective."""
+    x = places[piece]
     total = system.comm.allreduce(len(x))
     centre = system.comm.allreduce(x.sum(axis=0)) / total
-    motions = np.zeros((6, *x.shape))
+    motions = np.zeros((6, *places.shape))
     for i, axis in enumerate(np.eye(3)):
-        motions[i, :, i] = 1.0
-        motions[3 + i] = np.cross(axis, x - centre)
+        motions[i, piece, i] = 1.0
+        motions[3 + i, piece] = np.cross(axis, x - centre)
     rigid = motions.reshape(6, -1)
     stopped = rigid - np.array([system.held(v) for v in rigid])
     _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
@@ -201,7 +227,7 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
         shift = system.comm.allreduce(said.reshape(-1, 3).sum(axis=0)) / total
         moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
         raise MeshError(
-            "boundary: the shell is not held: it is free to "
+            f"boundary: the shell is not held{where}: it is free to "
             + (
                 f"move along ({', '.join(f'{c + 0.0:.2g}' for c in np.round(shift / np.linalg.norm(shift), 3))})"
                 if moves

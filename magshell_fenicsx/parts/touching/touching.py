@@ -306,17 +306,21 @@ class Touching:
         along = np.zeros((2, *beta.shape))
         for a in range(2):
             along[a, :, half:] = table[1 + a][0]
-        both = [
+        slope = [
             -beta[:, :, None] * y[1 + a][:, None, :] - (d[:, None] * along[a])[:, :, None] * n[:, None, :]
             for a in range(2)
         ]
-        C = np.stack(both, axis=1).reshape(len(d), 2, -1)
+        C = np.stack(slope, axis=1).reshape(len(d), 2, -1)
         g = (beta[:, :, None] * n[:, None, :]).reshape(len(d), -1)
-        across = np.eye(3) - n[:, :, None] * n[:, None, :]
-        B = beta[:, :, None, None, None] * beta[:, None, None, :, None] * across[:, None, :, None, :]
-        bend = B.reshape(len(d), g.shape[1], g.shape[1]) - np.einsum("nab,nai,nbj->nij", M, C, C, optimize=True)
-        H = second[:, None, None] * g[:, :, None] * g[:, None, :] - (first / d)[:, None, None] * bend
-        return self._weight(at)[:, None, None] * H, nodes
+        weight, bent = self._weight(at), self._weight(at) * first / d
+        left = np.concatenate([g[:, None], C], axis=1)
+        middle = np.zeros((len(d), 3, 3))
+        middle[:, 0, 0], middle[:, 1:, 1:] = weight * second + bent, bent[:, None, None] * M
+        H = left.transpose(0, 2, 1) @ (middle @ left)
+        both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
+        for i in range(3):
+            H[:, i::3, i::3] -= both
+        return H, nodes
 
     def _near_on_way(self, u: Array, v: Array) -> bool:
         """Whether any cells that may touch come near each other between two displacements; collective."""
