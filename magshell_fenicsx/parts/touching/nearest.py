@@ -5,7 +5,7 @@ within the undeformed surface is long.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -118,6 +118,8 @@ class Places:
         (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a side, none in a corner.
     distance
         (n,).
+    side
+        (n,): 1 of a point above its own surface's place, else 0.
     """
 
     point: Longs
@@ -125,10 +127,11 @@ class Places:
     X: Array
     free: Array
     distance: Array
+    side: Longs
 
     def of(self, which: Any) -> "Places":
         """Some of them."""
-        return Places(self.point[which], self.cell[which], self.X[which], self.free[which], self.distance[which])
+        return Places(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:

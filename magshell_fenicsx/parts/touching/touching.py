@@ -13,9 +13,10 @@ Springer 2006, sec. 4.1 and 9.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -40,7 +41,8 @@ MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs o
 BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
 MANY = 100_000  # pairs of a point and a cell at a time
 CHUNK = 1000  # blocks of a tangent at a time
-SAME = 1e-9  # of the thickness: distances that are equal
+BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `Joined`
+SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
 
@@ -145,6 +147,7 @@ class Touching:
         self._beside = cells.near_in_surface(r0, BESIDE * h)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._places = _none()
+        self._joined = Joined.of(self._places, 1.0)
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     # as a term
@@ -161,15 +164,16 @@ class Touching:
         """It has no forms."""
 
     def energy(self) -> float:
-        at, (value, _, _) = self._pressed()
-        return float(self._weight(at) @ value)
+        at, joined, (value, _, _) = self._pressed()
+        return float(self._points.weight[at.point[joined.first]] @ value) / 2
 
     def add_residual(self, b: Array, factor: float) -> None:
         whole = np.zeros(self._r0.shape)
-        at, (_, first, _) = self._pressed()
+        at, joined, (_, first, _) = self._pressed()
         if len(at.point):
             _, n, beta, nodes = self._geometry(at)
-            forces = -(factor * self._weight(at) * first)[:, None, None] * beta[:, :, None] * n[:, None, :]
+            size = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
+            forces = -size[:, None, None] * beta[:, :, None] * n[:, None, :]
             np.add.at(whole, nodes, forces)
         if self._comm.size > 1:
             whole = np.asarray(self._comm.allreduce(whole))
@@ -180,10 +184,13 @@ class Touching:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
-        at, (_, first, second) = self._pressed()
-        number = len(self._cells.nodes)
-        order = np.argsort(self._points.cell[at.point] * number + at.cell, kind="stable")
-        at, first, second = at.of(order), first[order], second[order]
+        whole, joined, (_, of_group, bend) = self._pressed()
+        number, several = len(self._cells.nodes), joined.several
+        first = of_group[joined.group]
+        second = np.where(several[joined.group], first / (BLUR * self._h), bend[joined.group])
+        weight = joined.weight * self._points.weight[whole.point] / 2
+        order = np.argsort(self._points.cell[whole.point] * number + whole.cell, kind="stable")
+        at, first, second, weight = whole.of(order), first[order], second[order], weight[order]
         keys = self._points.cell[at.point] * number + at.cell
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         rows, columns, values = list[Longs](), list[Longs](), list[Array]()
@@ -192,7 +199,7 @@ class Touching:
                 continue
             after = starts[np.searchsorted(starts, some[-1]) + 1 :]
             part = slice(some[0], after[0] if len(after) else len(keys))
-            H, nodes = self._hessians(at.of(part), first[part], second[part])
+            H, nodes = self._hessians(at.of(part), weight[part], first[part], second[part])
             sums = np.add.reduceat(H, some - some[0], axis=0)
             dofs = (3 * nodes[some - some[0]][:, :, None] + np.arange(3)).reshape(len(some), -1)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
@@ -202,14 +209,17 @@ class Touching:
         nothing = np.zeros(0, dtype=np.int64)
         if not rows:
             return nothing, nothing, np.zeros(0)
+        if several.any():
+            i, j, v = self._between(whole, joined, of_group, bend)
+            rows, columns, values = [*rows, i], [*columns, j], [*values, v]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     # what is seen
 
     def force(self) -> float:
         """The sum of the pressures over the contact, over E h R; collective."""
-        at, (_, first, _) = self._pressed()
-        return float(self._comm.allreduce(float(self._weight(at) @ first)))
+        at, joined, (_, first, _) = self._pressed()
+        return float(self._comm.allreduce(float(self._points.weight[at.point[joined.first]] @ first / 2)))
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
@@ -219,12 +229,12 @@ class Touching:
 
     def penetration(self) -> float:
         """The largest, over R; 0 where nothing touches; collective."""
-        at, _ = self._pressed()
+        at, *_ = self._pressed()
         return float(self._comm.allreduce(float((self._h - at.distance).max(initial=0.0)), MPI.MAX))
 
     def deepest(self) -> tuple[float, Array]:
         """The largest penetration over R, and its place (3,); collective."""
-        at, _ = self._pressed()
+        at, *_ = self._pressed()
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
@@ -238,12 +248,13 @@ class Touching:
 
         Of ghosts the pressure is zero and the gap the reach. Collective.
         """
-        at, (_, first, _) = self._pressed()
+        at, joined, (_, first, _) = self._pressed()
         points, start = self._points, self._points.first
         weight, p, gap = np.ones(points.local), np.zeros(points.local), np.full(points.local, (REACH - 1) * self._h)
         np.add.at(weight, points.cell - start, points.weight)
         weight[: len(np.unique(points.cell))] -= 1.0
-        np.add.at(p, points.cell[at.point] - start, points.weight[at.point] * first)
+        pressed = at.point[joined.first]
+        np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
         near = self._found(self._now(), REACH * self._h)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
@@ -273,16 +284,29 @@ class Touching:
         points = self._points
         return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
 
-    def _weight(self, at: Places) -> Array:
-        return np.asarray(self._points.weight[at.point] / 2)
-
-    def _pressed(self) -> tuple[Places, tuple[Array, Array, Array]]:
-        """The places that are pressed at the present state, and the penalty with its derivatives by the penetration."""
+    def _pressed(self) -> tuple[Places, "Joined", tuple[Array, Array, Array]]:
+        """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
+        with its derivatives by the penetration."""
         u = self._now()
         if not np.array_equal(u, self._at):
-            self._places, self._at = self._found(u, self._h), np.array(u)
-        at = self._places
-        return at, penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
+            self._places, self._at = self._found(u, (1 + SAME) * self._h), np.array(u)
+            self._joined = Joined.of(self._places, BLUR * self._h)
+        joined = self._joined
+        return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
+
+    def _between(self, at: Places, joined: "Joined", first: Array, second: Array) -> Entries:
+        """What the Hessian of joined places has besides those of each."""
+        some = joined.several[joined.group]
+        part, group = at.of(some), joined.group[some]
+        _, n, beta, nodes = self._geometry(part)
+        g = (joined.weight[some, None, None] * beta[:, :, None] * n[:, None, :]).reshape(len(n), -1)
+        dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(n), -1)
+        at_row = np.repeat(group, dofs.shape[1])
+        size = len(first), self._r0.size
+        G = scipy.sparse.coo_array((g.ravel(), (at_row, dofs.ravel())), size).tocsr()
+        weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
+        found = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
+        return found.row.astype(np.int64), found.col.astype(np.int64), found.data
 
     def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
         """Distances, normals, and beta (n, functions of both cells) with its nodes."""
@@ -295,7 +319,7 @@ class Touching:
         d = np.linalg.norm(off, axis=1)
         return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
 
-    def _hessians(self, at: Places, first: Array, second: Array) -> tuple[Array, Longs]:
+    def _hessians(self, at: Places, weight: Array, first: Array, second: Array) -> tuple[Array, Longs]:
         """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
         d, n, beta, nodes = self._geometry(at)
         r, half = self._r0 + self._at, nodes.shape[1] // 2
@@ -312,7 +336,7 @@ class Touching:
         ]
         C = np.stack(slope, axis=1).reshape(len(d), 2, -1)
         g = (beta[:, :, None] * n[:, None, :]).reshape(len(d), -1)
-        weight, bent = self._weight(at), self._weight(at) * first / d
+        bent = weight * first / d
         left = np.concatenate([g[:, None], C], axis=1)
         middle = np.zeros((len(d), 3, 3))
         middle[:, 0, 0], middle[:, 1:, 1:] = weight * second + bent, bent[:, None, None] * M
@@ -387,7 +411,7 @@ class Touching:
         point, cell, start = point[close], cell[close], start[close]
         if not len(point):
             return _none()
-        at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]))
+        at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
         return self._facing(at.of(at.distance < reach), r, x)
 
     def _facing(self, at: Places, r: Array, x: Array) -> Places:
@@ -413,10 +437,12 @@ class Touching:
         _, (_, t1), (_, t2) = jets(cells.element, self._reference(at.point), r[cells.nodes[points.cell[at.point]]], 1)
         (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
         above = np.sum(np.cross(t1, t2) * (x[at.point] - y), axis=1) > 0
-        order = np.lexsort((at.distance, above, at.point))
-        first = np.ones(len(order), dtype=bool)
-        first[1:] = (np.diff(at.point[order]) != 0) | (np.diff(above[order].astype(int)) != 0)
-        return at.of(np.sort(order[first]))
+        at = replace(at, side=above.astype(np.int64))
+        order = np.lexsort((at.distance, at.side, at.point))
+        at = at.of(order)
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
+        return at.of(at.distance < least + SAME * self._h)
 
     def _reference(self, point: Longs) -> Array:
         """Places (n, 2) of points in their cells: the shape functions are exact for them."""
@@ -425,4 +451,39 @@ class Touching:
 
 def _none() -> Places:
     nothing = np.zeros(0, dtype=np.int64)
-    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Places of a point on one side, in neighbouring cells, as one: a fold between cells has no jump then.
+
+    Attributes
+    ----------
+    first
+        (m,) the nearest place of each.
+    group
+        (n,) the joined one that a place belongs to.
+    distance
+        (m,) -e log sum exp(-d/e) of the distances d of its places, with a small e.
+    weight
+        (n,) its derivatives by these.
+    several
+        (m,) whether it has several places.
+    """
+
+    first: Longs
+    group: Longs
+    distance: Array
+    weight: Array
+    several: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, at: Places, blur: float) -> "Joined":
+        """Of places in the order of points, sides and distances."""
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        counts = np.diff([*first, len(at.point)])
+        group = np.repeat(np.arange(len(first)), counts)
+        size = np.exp((at.distance[first][group] - at.distance) / blur)
+        total = np.bincount(group, size, len(first))
+        return cls(first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1)
