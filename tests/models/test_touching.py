@@ -111,6 +111,26 @@ def test_nearest_places() -> None:
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
 
 
+@pytest.mark.parametrize("deep", [1e-4, 3e-3, 0.2])
+def test_folds_between_cells_have_no_jump(deep: float) -> None:
+    """On large cells some points are opposite a side, where their nearest place changes cells: differences 1e-6."""
+    thick = {**RING["shell"], "thickness": 0.08}
+    scene = Scene(Case.model_validate(RING | {"shell": thick, "mesh": {"size": 0.3, "degree": 3}}))
+    model, (term,) = scene.model, scene.model.touchings
+    system, h, r = model.system, model.material.h, model.r0.x.array.reshape(-1, 3)
+    u = np.zeros_like(r)
+    u[:, 1] = np.tanh(r[:, 1] / 0.3) * ((1 - deep) * h / 2 + 0.4 * r[:, 0] ** 2) - r[:, 1]
+    u = system.held(u.ravel()[: system.size])
+    v = system.held(1e-8 * h * np.random.default_rng(0).standard_normal(system.size))
+    mu = scene.unloaded().mu
+    at = system.at(State(u, mu))
+    Kv = times([(1.0, at.of(term.entries))], v)
+    _, joined, _ = at.of(term._pressed)
+    assert joined.several.any()
+    low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
+    assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+
+
 def test_a_step_that_passes_through() -> None:
     """Walls that change places on the straight way, and walls that only come near."""
     system, h = ring().model.system, ring().model.material.h
