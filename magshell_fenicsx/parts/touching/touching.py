@@ -172,8 +172,8 @@ class Touching:
         at, joined, (_, first, _) = self._pressed()
         if len(at.point):
             _, n, beta, nodes = self._geometry(at)
-            size = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
-            forces = -size[:, None, None] * beta[:, :, None] * n[:, None, :]
+            share = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
+            forces = -share[:, None, None] * beta[:, :, None] * n[:, None, :]
             np.add.at(whole, nodes, forces)
         if self._comm.size > 1:
             whole = np.asarray(self._comm.allreduce(whole))
