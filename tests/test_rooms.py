@@ -58,10 +58,6 @@ OF_TYPES = {
     "parts/supports/reacting.py",
     "parts/supports/reactions.py",
     "parts/magnetism/interacting.py",
-}
-    "parts/seen.py",
-    "parts/supports/reacting.py",
-    "parts/supports/reactions.py",
 }  # what is observed, of which they know no more than the type
 
 

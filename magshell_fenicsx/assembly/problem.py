@@ -16,6 +16,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.coupled import Coupled, Entries, times, with_entries
 from magshell_fenicsx.assembly.evaluated import Evaluated, Noise
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
@@ -94,11 +95,12 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
+        self._coupled = [t for t in terms if isinstance(t, Coupled)]
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
-        self._coupled = [t for t in terms if isinstance(t, WholeTerm)]
-        self._whole = WholeMatrix(V, clamped) if self._coupled else None
+        self._of_all = [t for t in terms if isinstance(t, WholeTerm)]
+        self._whole = WholeMatrix(V, clamped) if self._of_all else None
         self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
         for term in self._own_residual:
             term.compile_residual()
@@ -259,12 +261,21 @@ class FiniteElementSystem:
         """This rank's part of the tangent without supports times a vector, both with ghosts."""
         if self._assembler:
             found = self._assembler.times(v, factors)
-            return found + self._whole.times(self._among(factors), v) if self._whole else found
-        K = self._of_forms(self._unheld, factors, [])
-        given, found = K.createVecRight(), np.zeros_like(v)
-        given.array[:] = v[: self.size]
-        found[: self.size] = (K * given).array
+        else:
+            K = self._of_forms(self._unheld, factors, [])
+            given, found = K.createVecRight(), np.zeros_like(v)
+            given.array[:] = v[: self.size]
+            found[: self.size] = (K * given).array
+        if entries := self._entries(factors):
+            whole = self.comm.allreduce(times(entries, np.concatenate(self.comm.allgather(v[: self.size]))))
+            first = 3 * self.u.function_space.dofmap.index_map.local_range[0]
+            found[: self.size] += whole[first : first + self.size]
+        if self._whole:
+            found = found + self._whole.times(self._among(factors), v)
         return found
+
+    def _entries(self, factors: Mapping[str, float]) -> list[tuple[float, Entries]]:
+        return [(factor, t.entries()) for t in self._coupled if (factor := factors.get(t.name, 0.0))]
 
     def _tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
@@ -274,6 +285,10 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
+        if entries := self._entries(factors):
+            fixed = np.zeros(self.size, dtype=bool)
+            fixed[self._fixed] = True
+            K = with_entries(K, entries, np.concatenate(self.comm.allgather(fixed)))
         if self._whole:
             K = self._whole.sum(K, self._among(factors))
         if self.projection:
@@ -285,7 +300,7 @@ class FiniteElementSystem:
 
     def _among(self, factors: Mapping[str, float]) -> list[tuple[float, WholeTerm]]:
         """The terms that couple all unknowns, with their factors."""
-        return [(factor, t) for t in self._coupled if (factor := factors.get(t.name, 0.0))]
+        return [(factor, t) for t in self._of_all if (factor := factors.get(t.name, 0.0))]
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""

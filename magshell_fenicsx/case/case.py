@@ -31,6 +31,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts, parts_of
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.parts.touching.section import Pairs, refuse_unfit_pairs
 from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
@@ -97,6 +98,9 @@ class Case(WithParts):
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)
     """Name -> rigid body that presses on the shell, or stands in its way"""
+    contact: Pairs = Field(default=[])
+    """Pairs that may touch, half a thickness from their mid-surfaces, without friction: [[shell, shell]] is the shell
+    with itself; in place of `shell` the name of a patch of a mesh file"""
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
@@ -281,6 +285,11 @@ class Case(WithParts):
         for name, body in self.bodies.items():
             self.context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
         refuse_unfit_bodies(self.bodies, solid=self.model == "solid")
+        return self
+
+    @model_validator(mode="after")
+    def _contact_fits(self) -> Self:
+        refuse_unfit_pairs(self.contact, self.context, self.symmetry)
         return self
 
     @model_validator(mode="after")

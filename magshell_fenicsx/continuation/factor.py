@@ -122,7 +122,7 @@ class Factorisation:
         return True
 
     def _factor_any(self, K: PETSc.Mat) -> None:
-        if self._mumps is None:
+        if self._mumps is None or self._mumps.getOperators()[1].handle != K.handle:  # another pattern has new factors
             self._mumps = _new_pc(K, "mumps")
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()

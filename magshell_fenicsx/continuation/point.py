@@ -67,6 +67,10 @@ class PathStopped(RuntimeError):
         self.point, self.final = point, final
 
 
+class StepTooLong(RuntimeError):
+    """What lies between two points must not be: the step between them is to be shorter."""
+
+
 class Journal(Protocol):
     """The results of `Path.recorded`, in their order.
 

@@ -11,7 +11,7 @@ from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, 
 from magshell_fenicsx.continuation.control import projected
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import Path, Quantity
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
@@ -309,7 +309,7 @@ class Walk:
     ----------
     renew
         The state of the first of two successive points with other amplitudes beside that of the path, from which the
-        walk goes on in place of the second; None if that is accepted.
+        walk goes on in place of the second; None if that is accepted. It raises `StepTooLong` if it must not be.
 
     Attributes
     ----------
@@ -334,17 +334,22 @@ class Walk:
         PathStopped
             If the path is lost, returns to a fold that it has passed, or needs more steps than allowed.
         """
-        options, shorter = self.path.options, None
+        options, shorter, why = self.path.options, None, ""
         while True:
             for point, reached in self.path.towards(self.points[-1], self._ahead()):
                 low, shorter = self.points[-1], None
-                if self._renew and (state := self._renew(low, point)):
+                try:
+                    state = self._renew(low, point) if self._renew else None
+                except StepTooLong as e:
+                    shorter, why = abs(point.s - low.s) / 4, str(e)
+                    break
+                if state:
                     self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
                     break
                 try:
                     between = self._between(low, point)
                 except PathStopped:  # the step had left the branch: approach in shorter steps
-                    shorter = abs(point.s - low.s) / 4
+                    shorter, why = abs(point.s - low.s) / 4, "an instability cannot be located"
                     break
                 for label, found, self.done in between:
                     yield label, found
@@ -365,7 +370,7 @@ class Walk:
             if shorter is None:
                 return
             if shorter < options.smallest:
-                raise PathStopped("an instability cannot be located", self.points[-1])
+                raise PathStopped(why, self.points[-1])
             self.path = self.path.in_steps(replace(options, first=shorter))
 
     def _refuse_loop(self, fold: Point) -> None:

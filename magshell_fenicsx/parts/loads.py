@@ -11,6 +11,7 @@ from magshell_fenicsx.parts.magnetism.interaction import Interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.parts.touching.touching import Pair
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class Loads:
         Where its magnetic field is read.
     interaction
         How strongly its magnetised parts act on each other; None if they do not.
+    pairs
+        What may touch: the shell itself, or parts of it.
     """
 
     pressure: bool = False
@@ -43,6 +46,7 @@ class Loads:
     remanence: Magnetisation | None = None
     sensors: tuple[Sensor, ...] = ()
     interaction: Interaction | None = None
+    pairs: tuple[Pair, ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

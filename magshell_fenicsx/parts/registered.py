@@ -50,6 +50,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "magnetism.interaction.InteractionSeen",
     "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
+    "touching.seen.TouchingSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
@@ -58,6 +59,7 @@ ACCOUNTS = (  # modules here with a function `account`, in the order of `magshel
     "forces.dead_load",
     "supports.reacting",
     "bodies.standing",
+    "touching.section",
 )
 
 

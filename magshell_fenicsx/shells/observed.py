@@ -24,6 +24,7 @@ from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
+from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.shells.terms import EnergyFactory
 
 Array = NDArray[np.float64]
@@ -54,6 +55,8 @@ class Observed:
         Column -> the form that a term observes, see `OwnTerm.observed`; and what a field induces. Of the modelled part.
     contacts
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
+    touchings
+        The contacts of parts of the shell with each other, or with itself.
     growing
         The placement, where imperfections grow.
     axes
@@ -76,6 +79,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
+    touchings: Sequence[Touching] = ()
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None
     axes: ClassVar[list[int]] = [0, 1, 2]
@@ -133,11 +137,23 @@ class Observed:
         return at.of(lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0))
 
     def cell_pressures(self, state: State) -> Array | None:
-        """The pressure of all bodies in each local cell, see `Pressing`; None without bodies."""
-        if not self.contacts:
+        """The pressure of all contacts in each local cell, see `Pressing`; None without contacts."""
+        if not (self.contacts or self.touchings):
             return None
         pressings = [pressing for pressing, _ in self.contacts.values()]
-        return self.system.at(state).of(lambda: np.asarray(sum(each.cell_pressures() for each in pressings)))
+
+        def present() -> Array:
+            each = [pressing.cell_pressures() for pressing in pressings]
+            return np.asarray(sum((*each, *(touching.of_cells()[0] for touching in self.touchings))))
+
+        return self.system.at(state).of(present)
+
+    def cell_gaps(self, state: State) -> Array | None:
+        """The least gap over R in each local cell between parts of the shell, see `Touching`; None without pairs."""
+        if not self.touchings:
+            return None
+        gaps = self.system.at(state).of(lambda: [touching.of_cells()[1] for touching in self.touchings])
+        return np.asarray(np.min(gaps, axis=0))
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.

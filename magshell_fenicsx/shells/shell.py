@@ -53,6 +53,7 @@ from magshell_fenicsx.parts.supports.supports import (
     put_in_plane,
     refuse_unknown,
 )
+from magshell_fenicsx.parts.touching.building import touchings
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import EnergyFactory
 
@@ -214,6 +215,9 @@ class ShellModel(Thin):
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
+        rule = carrier.contact_rule
+        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule)
+        terms += self.touchings
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:
@@ -248,6 +252,7 @@ class ShellModel(Thin):
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
         stiffnesses = dict(known.history for known, _ in self.contacts.values())
+        stiffnesses |= dict(each.history for each in self.touchings)
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses
         )

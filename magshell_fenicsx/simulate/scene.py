@@ -145,7 +145,7 @@ class Scene:
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
-        options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts else None
+        options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts or self.model.touchings else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()

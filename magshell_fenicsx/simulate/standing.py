@@ -54,7 +54,7 @@ def refilled(scene: Scene, problem: Problem) -> bool:
     """
     model, old = scene.model, scene.problem
     same = bool(old.document.data) and _apart_from_fields(old) == _apart_from_fields(problem)
-    if not same or not model.thin or model.contacts or old.loads.dead:
+    if not same or not model.thin or model.contacts or model.touchings or old.loads.dead:
         return False
     if (old.axisymmetric, old.mirror, old.azimuth) != (problem.axisymmetric, problem.mirror, problem.azimuth):
         return False

@@ -6,6 +6,7 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
+from magshell_fenicsx.parts.bodies.press import finer as along_contact
 from magshell_fenicsx.parts.course import Drive, Gas, GasSection, Here
 from magshell_fenicsx.parts.pressure.pressure import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -42,8 +43,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
-    if course.finer:
-        path = path.in_steps(course.finer(path.options))
+    for finer in (course.finer, along_contact if scene.model.touchings else None):
+        path = path.in_steps(finer(path.options)) if finer else path
     if drive.end is not None and not drive.targets and course.until == "target":  # it is there
         yield Record("target", step.name, stage.point(start))
         return state

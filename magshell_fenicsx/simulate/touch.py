@@ -9,11 +9,12 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.touching.touching import Pair
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -69,7 +70,35 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
         deep = stage.scene.model.touching(state, contact.amplitude).penetration
         if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
             raised[contact.setting] = STIFFER * k
+    for pair, deep in between(stage.scene, state):
+        k = state.mu.get(pair.setting, pair.stiffness)
+        if deep > pair.bound * h and k < MOST_STIFF * pair.stiffness:
+            raised[pair.setting] = STIFFER * k
     return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+
+
+def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
+    """The pairs of shells that may touch, with their penetrations over R; collective."""
+    at = scene.model.system.at(state)
+    return [(each.pair, at.of(each.penetration)) for each in scene.model.touchings]
+
+
+def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
+    """See that no shell passes through another one, or itself, on the straight way between two points.
+
+    Raises
+    ------
+    StepTooLong
+        If one does.
+    """
+    model, comm = stage.scene.model, stage.scene.comm
+    if not model.touchings:
+        return
+    ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
+    whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
+    for each in model.touchings:
+        if each.through(*whole):
+            raise StepTooLong(f"the shortest step passes {each.pair.words} through each other")
 
 
 def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
@@ -145,6 +174,12 @@ def refuse_penetration(scene: Scene, state: State) -> None:
             raise Stopped(
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
                 f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
+            )
+    for pair, deep in between(scene, state):
+        if deep > pair.bound * h:
+            raise Stopped(
+                f"the penetration between {pair.words} is {deep / h:.3g} h, more than {pair.bound:g} h even with the "
+                "stiffest penalty: take smaller elements where they touch"
             )
 
 

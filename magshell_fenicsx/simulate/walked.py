@@ -16,7 +16,7 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
-from magshell_fenicsx.simulate.touch import refuse_crossing, refuse_return, stiffer
+from magshell_fenicsx.simulate.touch import refuse_crossing, refuse_passing, refuse_return, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
@@ -62,6 +62,7 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
 
     def checked(low: Point, high: Point) -> State | None:
         refuse_crossing(stage, low, high)
+        refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
         return stiffer(stage, low, high)
@@ -157,7 +158,7 @@ def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: 
         goal = Goal("points", steps=steps)
     for number, start in enumerate(crossing.starts, 1):
         by_arc = _by_arc(stage, path)
-        walk = Walk(by_arc, start, goal)
+        walk = _walk(stage, by_arc, start, goal) if stage.scene.model.touchings else Walk(by_arc, start, goal)
         watch.begin(by_arc, start, stage.leave, look=True)
         yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
         try:

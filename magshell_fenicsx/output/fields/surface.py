@@ -25,7 +25,8 @@ TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of
 HEXAHEDRON_NODES = 27
 SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strains and moments, at least; of many
 MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
-PRESSURE = "contact_pressure"  # of bodies, over E h/R: the mean over a cell
+GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
+PRESSURE = "contact_pressure"  # of bodies and of parts of the shell, over E h/R: the mean over a cell
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
 ON_PLANE = 1e-9  # over R
@@ -157,6 +158,10 @@ class SurfaceGatherer:
         pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
+        gap = self._model.cell_gaps(state) if state.mu else None
+        if gap is not None:
+            gap = np.repeat(gap[: self._owned, None] / self._model.material.h, len(self._places), axis=1)
+            values[GAP] = np.minimum(values.get(GAP, np.inf), gap)
         found = {name: self._averaged(each) for name, each in values.items()}
         nodes = self._averaged(jet[0])
         stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)

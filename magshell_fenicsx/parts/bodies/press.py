@@ -74,13 +74,15 @@ class ContactSection(PathStep):
         return "load" if self.control == "approach" else super().prescribed
 
     def course(self, here: Here) -> Course:
-        def finer(o: "StepOptions") -> "StepOptions":
-            return replace(o, easy=EASY, few=EASY, hard=HARD, smallest=min(o.smallest, SHARP))
-
         return replace(super().course(here), finer=finer)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(FIRST, -change)
+
+
+def finer(options: "StepOptions") -> "StepOptions":
+    """Steps of a path along which contact sets in, grows and ceases."""
+    return replace(options, easy=EASY, few=EASY, hard=HARD, smallest=min(options.smallest, SHARP))
 
 
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:

@@ -1,0 +1,1 @@
+"""Shells that touch each other or themselves."""

@@ -1,0 +1,267 @@
+"""The places of a mid-surface that are nearest to some of its points: the cells near by from a tree, then Newton.
+
+A point of a surface is near the material around itself, which it does not touch. So a cell counts only if the way to it
+within the undeformed surface is long.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Longs = NDArray[np.int64]
+BESIDE = (
+    4.8  # thicknesses of the way along sides of cells to what a point cannot touch: that is at most 1.2 times as long
+)
+BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
+LATTICE = 4  # parts of a side of a cell, between which the search for the nearest place begins
+STRIP = 500  # vertices from which ways are searched together
+ROUNDS = 30  # Newton's steps at most
+EXACT = 1e-14  # a smaller step, in the reference cell, is none
+FLAT = 1e-3  # of the determinant of a plane's Hessian: below it the step takes the plane's
+ON_SIDE = 1e-12  # a barycentric coordinate that is zero
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+SIDES = np.array([[-1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])  # direction of the side opposite to each corner
+DOWN = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # derivatives of the barycentric coordinates
+
+
+@dataclass(frozen=True)
+class Cells:
+    """All cells of a mid-surface, on every rank.
+
+    Attributes
+    ----------
+    element
+        Of basix, with its nodes.
+    nodes
+        (cells, functions): global numbers.
+    corners
+        (cells, 3): global numbers of vertices.
+    """
+
+    element: Any
+    nodes: Longs
+    corners: Longs
+
+    @cached_property
+    def across(self) -> Longs:
+        """(cells, 3): the cell across the side opposite to each corner; -1 at the boundary."""
+        pairs = np.sort(
+            np.stack([self.corners[:, [1, 2]], self.corners[:, [0, 2]], self.corners[:, [0, 1]]], 1), axis=2
+        )
+        keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
+        order = np.argsort(keys.ravel(), kind="stable")
+        twice = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
+        found = np.full(keys.size, -1)
+        a, b = order[twice], order[twice + 1]
+        found[a], found[b] = b // 3, a // 3
+        return np.asarray(found.reshape(-1, 3))
+
+    @cached_property
+    def lattice(self) -> tuple[Array, Array]:
+        """Places (m, 2) spread over the reference cell, and the shape functions there."""
+        n = LATTICE
+        X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+        return X, self.element.tabulate(0, X)[0, :, :, 0]
+
+    def near_in_surface(self, r0: Array, far: float) -> Longs:
+        """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than `far`.
+
+        Parameters
+        ----------
+        r0
+            (nodes, 3) undeformed.
+        """
+        count, n = int(self.corners.max()) + 1, len(self.corners)
+        x, at = np.zeros((count, 3)), self.element.tabulate(0, CORNERS)[0, :, :, 0]
+        x[self.corners] = np.einsum("ck,nki->nci", at, r0[self.nodes])
+        a, b = (np.concatenate([self.corners[:, c] for c in of]) for of in ((0, 1, 2), (1, 2, 0)))
+        ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
+        ways = ways.tocoo()
+        lengths = np.linalg.norm(x[ways.row] - x[ways.col], axis=1)
+        graph = scipy.sparse.coo_array((lengths, (ways.row, ways.col)), (count, count)).tocsr()
+        axis = int(np.ptp(x, axis=0).argmax())
+        order = np.argsort(x[:, axis], kind="stable")
+        near = list[tuple[Longs, Longs]]()
+        for some in np.array_split(order, max(1, count // STRIP)):  # a way that short leaves a strip by no more
+            low, high = x[some[0], axis] - far, x[some[-1], axis] + far
+            around = order[np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")]
+            inside = np.flatnonzero(np.isin(around, some))
+            reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=far)
+            row, column = np.nonzero(np.isfinite(reached))
+            near.append((around[inside[row]], around[column]))
+        i, j = (np.concatenate(each) for each in zip(*near, strict=True))
+        between = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()
+        has = scipy.sparse.coo_array((np.ones(3 * n), (np.repeat(np.arange(n), 3), self.corners.ravel())), (n, count))
+        i, j = (has.tocsr() @ between @ has.tocsr().T).nonzero()
+        return np.asarray(np.unique(i.astype(np.int64) * n + j))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Points and the places of a surface nearest to them.
+
+    Attributes
+    ----------
+    point, cell
+        (n,) numbers of the points, and of the cells of the places.
+    X
+        (n, 2) in the reference cell.
+    free
+        (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a side, none in a corner.
+    distance
+        (n,).
+    side
+        (n,): 1 of a point above its own surface's place, else 0.
+    """
+
+    point: Longs
+    cell: Longs
+    X: Array
+    free: Array
+    distance: Array
+    side: Longs
+
+    def of(self, which: Any) -> "Places":
+        """Some of them."""
+        return Places(*(getattr(self, each.name)[which] for each in fields(self)))
+
+
+def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
+    """Shape functions (n, functions) at places (n, 2), and the field of nodal vectors (n, functions, 3) there: itself
+    and its derivatives by the first coordinate, the second, and both twice."""
+    for table in element.tabulate(order, X)[..., 0]:
+        yield table, np.einsum("nk,nki->ni", table, nodal)
+
+
+def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Array, Array]:
+    """The places of triangles that are nearest to points, near the given ones.
+
+    Newton's method for half the square of the distance, in the sides of the triangle where these are in the way.
+
+    Parameters
+    ----------
+    x
+        (n, 3) points.
+    nodal
+        (n, functions, 3) of the triangles.
+    X
+        (n, 2) in the reference triangle.
+
+    Returns
+    -------
+    X, free, distance
+        See `Places`.
+    """
+    X, moving = np.array(X), np.arange(len(X))
+    for _ in range(ROUNDS):
+        if not len(moving):
+            break
+        at, some = X[moving], nodal[moving]
+        g, A = _convex(cells, x[moving], some, at)
+        free = _free(at, g, A)
+        step = -_reduced(free, A, g)
+        coordinates, change = _barycentric(at), step @ DOWN.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(change < -EXACT * 1e-3, -coordinates / change, np.inf)
+        part = np.minimum(room.min(axis=1), 1.0)
+        after = at + part[:, None] * step
+        hit = _barycentric(after)
+        hit[np.abs(hit) < ON_SIDE] = 0.0
+        hit[np.arange(len(hit)), room.argmin(axis=1)] *= room.min(axis=1) > 1.0
+        X[moving] = (hit / hit.sum(axis=1, keepdims=True))[:, 1:]
+        moving = moving[np.abs(X[moving] - at).max(axis=1) > EXACT]
+    (_, y), *_ = jets(cells.element, X, nodal, 0)
+    return X, free_at(cells, x, nodal, X), np.linalg.norm(x - y, axis=1)
+
+
+def free_at(cells: Cells, x: Array, nodal: Array, X: Array) -> Array:
+    """The directions in which places can move, see `Places`."""
+    return _free(X, *_convex(cells, x, nodal, X))
+
+
+def _convex(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Array]:
+    """Gradient and Hessian of half the square of the distance, with that of a plane where it is not convex."""
+    (_, y), (_, y1), (_, y2), (_, y11), (_, y12), (_, y22) = jets(cells.element, X, nodal)
+    g, A = slopes(x - y, y1, y2, y11, y12, y22)
+    plane = slopes(0 * y, y1, y2, y11, y12, y22)[1]
+    bent = (np.linalg.det(A) < FLAT * np.linalg.det(plane)) | (np.trace(A, axis1=1, axis2=2) <= 0)
+    return g, np.where(bent[:, None, None], plane, A)
+
+
+def _barycentric(X: Array) -> Array:
+    return np.column_stack([1 - X.sum(axis=1), X])
+
+
+def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array) -> tuple[Array, Array]:
+    """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2, 2)."""
+
+    def dot(a: Array, b: Array) -> Array:
+        return np.asarray(np.sum(a * b, axis=1))
+
+    mixed = dot(y1, y2) - dot(off, y12)
+    A = np.stack([dot(y1, y1) - dot(off, y11), mixed, mixed, dot(y2, y2) - dot(off, y22)], axis=1).reshape(-1, 2, 2)
+    return -np.stack([dot(off, y1), dot(off, y2)], axis=1), A
+
+
+def _free(X: Array, g: Array, A: Array) -> Array:
+    """The directions as columns (n, 2, 2) in which places can move, see `Places`.
+
+    From a side or a corner a place goes inside if Newton's step does; else along a side if the distance falls there.
+    """
+    on = _barycentric(X) <= ON_SIDE
+    free = np.tile(np.eye(2), (len(X), 1, 1))
+    inward = _reduced(free, A, -g) @ DOWN.T
+    out = (on & (inward < 0)).any(axis=1)
+    for side in range(3):
+        free[out & on[:, side] & (on.sum(axis=1) == 1)] = np.column_stack([SIDES[side], np.zeros(2)])
+    for corner in range(3):
+        here = np.flatnonzero(out & (on.sum(axis=1) == 2) & ~on[:, corner])
+        ways = [CORNERS[c] - CORNERS[corner] for c in range(3) if c != corner]
+        gain = np.stack([np.maximum(-g[here] @ w, 0) ** 2 / np.einsum("i,nij,j->n", w, A[here], w) for w in ways], 1)
+        free[here] = 0.0
+        for k, way in enumerate(ways):
+            free[here[(gain[:, k] > 0) & (gain[:, k] >= gain[:, 1 - k])]] = np.column_stack([way, np.zeros(2)])
+    return free
+
+
+def _reduced(free: Array, A: Array, g: Array) -> Array:
+    """A^-1 g in the free directions."""
+    return np.asarray(np.einsum("nij,nj->ni", free, np.einsum("nij,nj->ni", inverse(free, A), _along(free, g))))
+
+
+def _along(free: Array, g: Array) -> Array:
+    return np.asarray(np.einsum("nji,nj->ni", free, g))
+
+
+def inverse(free: Array, A: Array) -> Array:
+    """The inverse (n, 2, 2) of A in the free directions, one where there is none."""
+    none = np.asarray(~free.any(axis=1))
+    reduced = np.einsum("nji,njk,nkl->nil", free, A, free)
+    reduced[:, 0, 0] += none[:, 0]
+    reduced[:, 1, 1] += none[:, 1]
+    return np.asarray(np.linalg.inv(reduced))
+
+
+def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs]:
+    """Pairs i != j of spheres that are nearer to each other than a reach, in classes of similar radii."""
+    size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
+    classes = [np.flatnonzero(size == k) for k in np.unique(size)]
+    trees = [cKDTree(centres[each]) for each in classes]
+    found = list[tuple[Longs, Longs]]()
+    for a, first in enumerate(classes):
+        for b, second in enumerate(classes):
+            most = radii[first].max() + radii[second].max() + reach
+            near = trees[a].sparse_distance_matrix(trees[b], most, output_type="ndarray")
+            i, j = first[near["i"]], second[near["j"]]
+            fits = (near["v"] < radii[i] + radii[j] + reach) & (i != j)
+            found.append((i[fits], j[fits]))
+    i, j = (np.concatenate(each).astype(np.int64) for each in zip(*found, strict=True))
+    return i, j

@@ -1,0 +1,87 @@
+"""The key `contact`: which shells may touch, and what a case with it can be."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.touching.touching import Pair
+from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.symmetry import Leaves, nothing
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.step import ProgrammeStep
+
+WHOLE = "shell"
+STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
+Pairs = Annotated[
+    list[Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]],
+    Field(max_length=20),
+]
+
+
+def pairs(given: Sequence[Sequence[str]], material: Material) -> tuple[Pair, ...]:
+    """What a case's pairs are in a model."""
+    k = STIFF / (12 * (1 - material.nu**2))
+    several = len(given) > 1
+    return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
+
+
+def leaves(given: Sequence[Sequence[str]]) -> list[Leaves]:
+    """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
+    return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)] if given else []
+
+
+def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str) -> None:
+    """See that a model can have these contacts.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    if not given:
+        return
+    seen = set[frozenset[str]]()
+    for i, pair in enumerate(given):
+        if frozenset(pair) in seen:
+            raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
+        seen.add(frozenset(pair))
+        for name in pair:
+            if name != WHOLE and not isinstance(context.shell, MeshSurface):
+                raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
+    if context.solid:
+        raise ValueError("contact: is of shells: take model: shell")
+    if context.shell.thickness_factor is not None:
+        raise ValueError("contact: needs the same thickness everywhere: leave out shell.thickness_factor")
+    if symmetry in ("half", "axisymmetric"):
+        raise ValueError(
+            f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "
+            "it between edges with boundary: symmetry"
+        )
+    for step in context.steps:
+        _refuse_step(step)
+    if context.sections.get("gradients"):
+        raise ValueError("gradients: of shells that may touch each other are not built: leave out contact or gradients")
+
+
+def _refuse_step(step: "ProgrammeStep") -> None:
+    for kind, why in (("time", "steps in time do not know it"), ("imperfection", "the undeformed gaps would change")):
+        if step.kind == kind:
+            raise ValueError(f"{step.key}.kind: {kind}: with contact, {why}: take steps along a path")
+    if getattr(step.load, "then", None) or getattr(step.load, "sensitivities", False):
+        key = "then" if getattr(step.load, "then", None) else "sensitivities"
+        raise ValueError(f"{step.key}.{key}: with contact between shells it is not built: leave it out")
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """What may touch, and how stiff it is."""
+    return Account(
+        [
+            f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"
+            for pair in loads.pairs
+        ]
+    )

@@ -1,0 +1,65 @@
+"""What is seen of shells that touch: the force, the least gap and the penalty's stiffness."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.parts.touching.touching import Pair
+
+
+class TouchingSeen(Seen):
+    """Of each pair."""
+
+    quantities = (
+        Quantity(
+            "contact_force",
+            "contact force",
+            "Between shells that touch, or parts of one: the integral of the pressure over the contact; of several "
+            "pairs contact_force_ONE_OTHER.",
+            "load",
+            "F R/(2πD)",
+            (POINT_FORCE,),
+            each=True,
+        ),
+        Quantity(
+            "contact_gap_over_h",
+            "least gap",
+            "Between the faces of shells that may touch, negative by the penetration of the penalty; no number while "
+            "no places nearer than 4 h face each other.",
+            "error",
+            "",
+            (THICKNESS,),
+            each=True,
+        ),
+        Quantity(
+            "contact_penalty",
+            "stiffness between shells",
+            "Of the penalty, in E h/R²; raised fourfold where shells would penetrate by more than 1e-3 h.",
+            "error",
+            each=True,
+        ),
+    )
+
+    def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(pair.setting for pair in loads.pairs)
+
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        return tuple(column for pair in loads.pairs for column in _columns(pair))
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+        model, values = sight.model, dict[str, float]()
+        for each in model.touchings:
+            at = model.system.at(state)
+            force, gap = at.of(each.force), at.of(each.least_gap)
+            numbers = force / model.force_unit, gap / sight.h, each.stiffness.value
+            values |= dict(zip(_columns(each.pair), numbers, strict=True))
+        return values
+
+
+def _columns(pair: "Pair") -> Iterator[str]:
+    return (q.name + pair.suffix for q in TouchingSeen.quantities)

@@ -1,0 +1,489 @@
+"""Contact of a shell with itself or of its parts with each other: the penalty of the gap between their faces.
+
+Each mid-surface has points of a quadrature. The gap of a point x is |x - y| - h with the nearest place y of the other
+mid-surface: the faces are half a thickness from both. Both surfaces have points, so that each has half of the penalty.
+A gap is a function of the state alone, and has no side: see `through` for steps that would pass through.
+
+With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
+
+    d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),   A = F,ab
+
+where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
+Springer 2006, sec. 4.1 and 9.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.parts.bodies.contact import SOFT, penalty
+from magshell_fenicsx.parts.touching.nearest import (
+    BESIDE,
+    BULGE,
+    Cells,
+    Longs,
+    Places,
+    inverse,
+    jets,
+    near_pairs,
+    slopes,
+)
+from magshell_fenicsx.parts.touching.nearest import project as projected
+
+Array = NDArray[np.float64]
+REACH = 4.0  # thicknesses: farther places are not looked for
+MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
+BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
+MANY = 100_000  # pairs of a point and a cell at a time
+CHUNK = 1000  # blocks of a tangent at a time
+BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `Joined`
+SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
+PART = 0.25  # of the thickness: how far points move between two looks at a step
+NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What may touch, dimensionless.
+
+    Attributes
+    ----------
+    names
+        Of both: `shell`, or a patch.
+    suffix
+        What its columns have at their ends.
+    stiffness
+        k of the penalty, over E h/R^2.
+    bound
+        Largest penetration that is allowed, over h.
+    """
+
+    names: tuple[str, str]
+    suffix: str
+    stiffness: float
+    bound: float = 1e-3
+
+    @property
+    def setting(self) -> str:
+        """Name of its stiffness in a state; no name of a user has a space."""
+        return f"stiffness between {self.names[0]} and {self.names[1]}"
+
+    @property
+    def words(self) -> str:
+        """What it is, in messages."""
+        return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
+
+
+@dataclass
+class Number:
+    """A number that a state sets."""
+
+    value: float
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of this rank at which gaps are measured.
+
+    Attributes
+    ----------
+    cell
+        (n,) global number.
+    shape
+        (n, functions) of that cell.
+    weight
+        (n,) undeformed area over R^2.
+    first, local
+        Number of the first cell of this rank, and how many it has with ghosts.
+    """
+
+    cell: Longs
+    shape: Array
+    weight: Array
+    first: int
+    local: int
+
+
+class Touching:
+    """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+
+    Parameters
+    ----------
+    allowed
+        Whether points of cells (n,) may touch cells (n,).
+    h
+        Thickness over R.
+    r0, u
+        All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
+    first, own
+        Number of the first degree of freedom of this rank, and how many it has.
+    """
+
+    amplitude = None
+    column = ""
+
+    def __init__(
+        self,
+        pair: Pair,
+        cells: Cells,
+        points: Points,
+        allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
+        h: float,
+        r0: Array,
+        u: Callable[[], Array],
+        own: tuple[int, int],
+        comm: MPI.Comm,
+    ) -> None:
+        self.pair, self.name = pair, f"contact{pair.suffix}"
+        self.group = self.name
+        self.stiffness = Number(pair.stiffness)
+        self._cells, self._points, self._allowed, self._h = cells, points, allowed, h
+        self._r0, self._u, self._own, self._comm = r0, u, own, comm
+        self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
+        self._places = _none()
+        self._joined = Joined.of(self._places, 1.0)
+        self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
+
+    # as a term
+
+    @property
+    def history(self) -> tuple[str, tuple[Number, float]]:
+        """See `FiniteElementSystem`."""
+        return self.pair.setting, (self.stiffness, self.pair.stiffness)
+
+    def compile_residual(self) -> None:
+        """It has no forms."""
+
+    def compile_tangent(self) -> None:
+        """It has no forms."""
+
+    def energy(self) -> float:
+        at, joined, (value, _, _) = self._pressed()
+        return float(self._points.weight[at.point[joined.first]] @ value) / 2
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        whole = np.zeros(self._r0.shape)
+        at, joined, (_, first, _) = self._pressed()
+        if len(at.point):
+            _, n, beta, nodes = self._geometry(at)
+            share = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
+            forces = -share[:, None, None] * beta[:, :, None] * n[:, None, :]
+            np.add.at(whole, nodes, forces)
+        if self._comm.size > 1:
+            whole = np.asarray(self._comm.allreduce(whole))
+        start, size = self._own
+        b[:size] += whole.ravel()[start : start + size]
+
+    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
+        """None here: what assembles the others adds `entries`."""
+
+    def entries(self) -> Entries:
+        whole, joined, (_, of_group, bend) = self._pressed()
+        number, several = len(self._cells.nodes), joined.several
+        first = of_group[joined.group]
+        second = np.where(several[joined.group], first / (BLUR * self._h), bend[joined.group])
+        weight = joined.weight * self._points.weight[whole.point] / 2
+        order = np.argsort(self._points.cell[whole.point] * number + whole.cell, kind="stable")
+        at, first, second, weight = whole.of(order), first[order], second[order], weight[order]
+        keys = self._points.cell[at.point] * number + at.cell
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        rows, columns, values = list[Longs](), list[Longs](), list[Array]()
+        for some in np.array_split(starts, max(1, len(keys) // CHUNK)):
+            if not len(some):
+                continue
+            after = starts[np.searchsorted(starts, some[-1]) + 1 :]
+            part = slice(some[0], after[0] if len(after) else len(keys))
+            H, nodes = self._hessians(at.of(part), weight[part], first[part], second[part])
+            sums = np.add.reduceat(H, some - some[0], axis=0)
+            dofs = (3 * nodes[some - some[0]][:, :, None] + np.arange(3)).reshape(len(some), -1)
+            i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+            rows.append(i.ravel())
+            columns.append(j.ravel())
+            values.append(sums.ravel())
+        nothing = np.zeros(0, dtype=np.int64)
+        if not rows:
+            return nothing, nothing, np.zeros(0)
+        if several.any():
+            i, j, v = self._between(whole, joined, of_group, bend)
+            rows, columns, values = [*rows, i], [*columns, j], [*values, v]
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    # what is seen
+
+    def force(self) -> float:
+        """The sum of the pressures over the contact, over E h R; collective."""
+        at, joined, (_, first, _) = self._pressed()
+        return float(self._comm.allreduce(float(self._points.weight[at.point[joined.first]] @ first / 2)))
+
+    def least_gap(self) -> float:
+        """Over R; nan where no places face each other within the reach; collective."""
+        places = self._found(self._now(), REACH * self._h)
+        least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
+        return least - self._h if np.isfinite(least) else np.nan
+
+    def penetration(self) -> float:
+        """The largest, over R; 0 where nothing touches; collective."""
+        at, *_ = self._pressed()
+        return float(self._comm.allreduce(float((self._h - at.distance).max(initial=0.0)), MPI.MAX))
+
+    def deepest(self) -> tuple[float, Array]:
+        """The largest penetration over R, and its place (3,); collective."""
+        at, *_ = self._pressed()
+        mine = (0.0, np.zeros(3))
+        if len(at.point):
+            worst = int(at.distance.argmin())
+            x = self._x(self._r0 + self._now())[at.point[worst]]
+            mine = (float(self._h - at.distance[worst]), x)
+        deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
+        return float(deep), np.asarray(place)
+
+    def of_cells(self) -> tuple[Array, Array]:
+        """The mean pressure over E h/R, and the least gap over R within the reach, of local cells.
+
+        Of ghosts the pressure is zero and the gap the reach. Collective.
+        """
+        at, joined, (_, first, _) = self._pressed()
+        points, start = self._points, self._points.first
+        weight, p, gap = np.ones(points.local), np.zeros(points.local), np.full(points.local, (REACH - 1) * self._h)
+        np.add.at(weight, points.cell - start, points.weight)
+        weight[: len(np.unique(points.cell))] -= 1.0
+        pressed = at.point[joined.first]
+        np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
+        near = self._found(self._now(), REACH * self._h)
+        np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
+        return p / weight, gap
+
+    def through(self, u: Array, v: Array) -> bool:
+        """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
+
+        Between two looks none moves, relative to another, by more than a part of the thickness.
+        """
+        moved = v - u
+        moved = moved - moved.mean(axis=0)
+        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * self._h)))
+        if not self._near_on_way(u, v):
+            return False
+        for k in range(1, looks):
+            near = self._found(u + k / looks * (v - u), NEARER * self._h)
+            if self._comm.allreduce(len(near.point)):
+                return True
+        return False
+
+    # geometry
+
+    def _now(self) -> Array:
+        return self._u()
+
+    def _x(self, r: Array) -> Array:
+        points = self._points
+        return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
+
+    def _pressed(self) -> tuple[Places, "Joined", tuple[Array, Array, Array]]:
+        """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
+        with its derivatives by the penetration."""
+        u = self._now()
+        if not np.array_equal(u, self._at):
+            self._places, self._at = self._found(u, (1 + SAME) * self._h), np.array(u)
+            self._joined = Joined.of(self._places, BLUR * self._h)
+        joined = self._joined
+        return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
+
+    def _between(self, at: Places, joined: "Joined", first: Array, second: Array) -> Entries:
+        """What the Hessian of joined places has besides those of each."""
+        some = joined.several[joined.group]
+        part, group = at.of(some), joined.group[some]
+        _, n, beta, nodes = self._geometry(part)
+        g = (joined.weight[some, None, None] * beta[:, :, None] * n[:, None, :]).reshape(len(n), -1)
+        dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(n), -1)
+        at_row = np.repeat(group, dofs.shape[1])
+        size = len(first), self._r0.size
+        G = scipy.sparse.coo_array((g.ravel(), (at_row, dofs.ravel())), size).tocsr()
+        weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
+        found = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
+        return found.row.astype(np.int64), found.col.astype(np.int64), found.data
+
+    def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
+        """Distances, normals, and beta (n, functions of both cells) with its nodes."""
+        nodes = np.concatenate([self._cells.nodes[self._points.cell[at.point]], self._cells.nodes[at.cell]], axis=1)
+        r = self._r0 + self._at
+        half = nodes.shape[1] // 2
+        N = self._points.shape[at.point]
+        (shape, y), *_ = jets(self._cells.element, at.X, r[nodes[:, half:]], 0)
+        off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
+        d = np.linalg.norm(off, axis=1)
+        return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
+
+    def _hessians(self, at: Places, weight: Array, first: Array, second: Array) -> tuple[Array, Longs]:
+        """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
+        d, n, beta, nodes = self._geometry(at)
+        r, half = self._r0 + self._at, nodes.shape[1] // 2
+        table = list(jets(self._cells.element, at.X, r[nodes[:, half:]]))
+        y = [each for _, each in table]
+        A = slopes(d[:, None] * n, y[1], y[2], y[3], y[4], y[5])[1]
+        M = np.einsum("nik,nkl,njl->nij", at.free, inverse(at.free, A), at.free)
+        along = np.zeros((2, *beta.shape))
+        for a in range(2):
+            along[a, :, half:] = table[1 + a][0]
+        slope = [
+            -beta[:, :, None] * y[1 + a][:, None, :] - (d[:, None] * along[a])[:, :, None] * n[:, None, :]
+            for a in range(2)
+        ]
+        C = np.stack(slope, axis=1).reshape(len(d), 2, -1)
+        g = (beta[:, :, None] * n[:, None, :]).reshape(len(d), -1)
+        bent = weight * first / d
+        left = np.concatenate([g[:, None], C], axis=1)
+        middle = np.zeros((len(d), 3, 3))
+        middle[:, 0, 0], middle[:, 1:, 1:] = weight * second + bent, bent[:, None, None] * M
+        H = left.transpose(0, 2, 1) @ (middle @ left)
+        both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
+        for i in range(3):
+            H[:, i::3, i::3] -= both
+        return H, nodes
+
+    def _near_on_way(self, u: Array, v: Array) -> bool:
+        """Whether any cells that may touch come near each other between two displacements; collective."""
+        both = [self._spheres(self._r0 + each) for each in (u, v)]
+        centres = (both[0][0] + both[1][0]) / 2
+        apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
+        radii = np.maximum(both[0][1], both[1][1]) + apart
+        near = self._fit(*near_pairs(centres, radii, self._h))
+        return bool(self._comm.allreduce(len(near[0])))
+
+    def _spheres(self, r: Array) -> tuple[Array, Array]:
+        """Centres and radii of spheres around all cells."""
+        nodal = r[self._cells.nodes]
+        centres = nodal.mean(axis=1)
+        return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+
+    def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
+        """The pairs of cells that may touch."""
+        keys = i * len(self._cells.nodes) + j
+        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
+        fits = (self._beside[at] != keys) & self._allowed(i, j)
+        return i[fits], j[fits]
+
+    def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
+        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
+        if reach in self._tracked:
+            then, margin, pairs = self._tracked[reach]
+            moved = 2 * float(np.linalg.norm(u - then, axis=1).max(initial=0.0))
+            if moved + reach <= margin:
+                return pairs
+        centres, radii = self._spheres(self._r0 + u)
+        margin = reach + MARGIN * float(radii.mean())
+        i, j = self._fit(*near_pairs(centres, radii, margin))
+        mine = np.zeros(len(centres), dtype=bool)
+        mine[self._points.cell] = True
+        pairs = i[mine[i]], j[mine[i]]
+        self._tracked[reach] = np.array(u), margin, pairs
+        return pairs
+
+    def _found(self, u: Array, reach: float) -> Places:
+        """The places that points of this rank face at a displacement, within a distance."""
+        i, j = self._near_cells(u, reach)
+        points, cells, r = self._points, self._cells, self._r0 + u
+        x, (centres, radii) = self._x(r), self._spheres(r)
+        count = np.bincount(points.cell, minlength=len(cells.nodes))
+        order = np.argsort(points.cell, kind="stable")
+        firsts = np.concatenate([[0], np.cumsum(count)])
+        n = count[i]
+        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
+        close = np.linalg.norm(x[point] - centres[cell], axis=1) < radii[cell] + reach
+        point, cell = point[close], cell[close]
+        if not len(point):
+            return _none()
+        X, shape = cells.lattice
+        used, which = np.unique(cell, return_inverse=True)
+        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used]])
+        start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
+        for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
+            away = np.linalg.norm(spread[which[some]] - x[point[some], None], axis=2)
+            start[some] = away.argmin(axis=1)
+            least[some] = away[np.arange(len(some)), start[some]]
+        close = least < reach + BETWEEN * radii[cell]
+        point, cell, start = point[close], cell[close], start[close]
+        if not len(point):
+            return _none()
+        at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
+        return self._facing(at.of(at.distance < reach), r, x)
+
+    def _facing(self, at: Places, r: Array, x: Array) -> Places:
+        """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
+        has one on each side of its own surface at most."""
+        cells, number = self._cells, len(self._cells.nodes)
+        keys = at.point * number + at.cell
+        order = np.argsort(keys, kind="stable")
+        at, keys = at.of(order), keys[order]
+        on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
+        stays = np.ones(len(keys), dtype=bool)
+        for side in range(3):
+            beyond = cells.across[at.cell, side]
+            asked = on[:, side] & (beyond >= 0)
+            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            known = keys[there] == at.point * number + beyond
+            nearer = at.distance[there] < at.distance - SAME * self._h
+            stays &= ~asked | (known & ~nearer)
+        at = at.of(stays)
+        if not len(at.point):
+            return at
+        points = self._points
+        _, (_, t1), (_, t2) = jets(cells.element, self._reference(at.point), r[cells.nodes[points.cell[at.point]]], 1)
+        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
+        above = np.sum(np.cross(t1, t2) * (x[at.point] - y), axis=1) > 0
+        at = replace(at, side=above.astype(np.int64))
+        order = np.lexsort((at.distance, at.side, at.point))
+        at = at.of(order)
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
+        return at.of(at.distance < least + SAME * self._h)
+
+    def _reference(self, point: Longs) -> Array:
+        """Places (n, 2) of points in their cells: the shape functions are exact for them."""
+        return np.asarray(self._points.shape[point] @ self._cells.element.points)
+
+
+def _none() -> Places:
+    nothing = np.zeros(0, dtype=np.int64)
+    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Places of a point on one side, in neighbouring cells, as one: a fold between cells has no jump then.
+
+    Attributes
+    ----------
+    first
+        (m,) the nearest place of each.
+    group
+        (n,) the joined one that a place belongs to.
+    distance
+        (m,) -e log sum exp(-d/e) of the distances d of its places, with a small e.
+    weight
+        (n,) its derivatives by these.
+    several
+        (m,) whether it has several places.
+    """
+
+    first: Longs
+    group: Longs
+    distance: Array
+    weight: Array
+    several: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, at: Places, blur: float) -> "Joined":
+        """Of places in the order of points, sides and distances."""
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        counts = np.diff([*first, len(at.point)])
+        group = np.repeat(np.arange(len(first)), counts)
+        size = np.exp((at.distance[first][group] - at.distance) / blur)
+        total = np.bincount(group, size, len(first))
+        return cls(first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1)

@@ -1,0 +1,157 @@
+"""Shells that touch themselves: derivatives, patch tests, nearest places, and what is refused."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.touching.touching import Touching
+
+Array = NDArray[np.float64]
+RING: dict[str, Any] = {
+    "shell": {
+        "geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0
+    },
+    "boundary": {
+        "bottom": "symmetry", "top": "symmetry",
+        "east": {"held": ["y"]}, "west": {"held": ["y"]}, "north": {"held": ["x"]},
+    },
+    "points": {"east": [1, 0, 0], "west": [-1, 0, 0], "north": [0, 1, 0]},
+    "contact": [["shell", "shell"]],
+    "mesh": {"size": 0.2, "degree": 3},
+    "loading": {"kind": "pressure"},
+}  # fmt: skip
+
+
+@cache
+def ring() -> Scene:
+    return Scene(Case.model_validate(RING))
+
+
+def touching() -> Touching:
+    (found,) = ring().model.touchings
+    assert isinstance(found, Touching)
+    return found
+
+
+def flattened(half: float, tilt: float, noise: float = 0.0, seed: int = 0) -> Array:
+    """The ring with walls at +-half h (1 + tilt x) where |x| < 0.5, and wide ends, with noise over h."""
+    model = ring().model
+    h, r = model.material.h, model.r0.x.array.reshape(-1, 3)
+    u = np.zeros_like(r)
+    width = half * h * (1 + tilt * r[:, 0]) + 0.4 * np.maximum(np.abs(r[:, 0]) - 0.5, 0) ** 2
+    u[:, 1] = np.tanh(r[:, 1] / 0.2) * width - r[:, 1]
+    rough = np.random.default_rng(seed).standard_normal(u.size)
+    return model.system.held((u.ravel() + noise * h * rough)[: model.system.size])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derivatives(seed: int) -> None:
+    """Central differences of the energy and of the forces at a rough state, some points open: 1e-6."""
+    system, h, mu = ring().model.system, ring().model.material.h, ring().unloaded().mu
+    u, term = flattened(0.497, 0.02, 0.002, seed), touching()
+    v = system.held(1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size))
+    at = system.at(State(u, mu))
+    entries = at.of(term.entries)
+    forces = [system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5)]
+    Kv = times([(1.0, entries)], v)
+    assert np.abs(forces[1] - forces[0] - Kv).max() < 1e-6 * np.abs(Kv).max()
+    energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
+    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-5)
+    other = system.held(np.random.default_rng(seed).standard_normal(system.size))
+    assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)  # it is symmetric
+    assert at.of(term.least_gap) < 0
+
+
+def test_the_tangent_holds_what_couples() -> None:
+    """The assembled tangent of all terms, also where nothing touched at first."""
+    system, h, mu = ring().model.system, ring().model.material.h, ring().unloaded().mu
+    v = system.held(1e-8 * h * np.random.default_rng(1).standard_normal(system.size))
+    for half in (0.6, 0.499, 0.6):
+        u = flattened(half, 0.02)
+        K = system.tangent(u, mu)
+        given = K.createVecRight()
+        given.array[:] = v
+        Kv = (K * given).array * (system.held(np.ones(system.size)) != 0)
+        low, high = (system.residual(u + side * v, mu) for side in (-0.5, 0.5))
+        assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+
+
+def test_the_material_around_a_point_does_not_touch_it() -> None:
+    """A ring that is bent to any shape without contact has none; nor has it energy."""
+    system, mu = ring().model.system, ring().unloaded().mu
+    assert system.energies(0 * flattened(0.6, 0.0), mu)[touching().name] == 0
+    assert system.energies(flattened(0.6, 0.0), mu)[touching().name] == 0
+    at = system.at(State(0 * flattened(0.6, 0.0), mu))
+    assert np.isnan(at.of(touching().least_gap))  # the farthest place of a ring is no nearest one
+
+
+def test_nearest_places() -> None:
+    """Against a search over a fine lattice of all cells that are not beside a point."""
+    model, term = ring().model, touching()
+    at = model.system.at(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
+    h, cells, points = model.material.h, term._cells, term._points
+    places = at.of(lambda: term._found(term._now(), 4 * h))
+    r = at.of(lambda: term._r0 + term._now())
+    x, n = term._x(r), 40
+    X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+    fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
+    inner = np.flatnonzero(np.abs(x[places.point, 0]) < 0.4)
+    assert len(inner) > 300
+    for k in inner[::20]:
+        i = points.cell[places.point[k]]
+        _, far = term._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
+        least = np.linalg.norm(fine[far] - x[places.point[k]], axis=-1).min()
+        assert places.distance[k] <= least + 1e-12
+        assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
+
+
+@pytest.mark.parametrize("deep", [1e-4, 3e-3, 0.2])
+def test_folds_between_cells_have_no_jump(deep: float) -> None:
+    """On large cells some points are opposite a side, where their nearest place changes cells: differences 1e-6."""
+    thick = {**RING["shell"], "thickness": 0.08}
+    scene = Scene(Case.model_validate(RING | {"shell": thick, "mesh": {"size": 0.3, "degree": 3}}))
+    model, (term,) = scene.model, scene.model.touchings
+    system, h, r = model.system, model.material.h, model.r0.x.array.reshape(-1, 3)
+    u = np.zeros_like(r)
+    u[:, 1] = np.tanh(r[:, 1] / 0.3) * ((1 - deep) * h / 2 + 0.4 * r[:, 0] ** 2) - r[:, 1]
+    u = system.held(u.ravel()[: system.size])
+    v = system.held(1e-8 * h * np.random.default_rng(0).standard_normal(system.size))
+    mu = scene.unloaded().mu
+    at = system.at(State(u, mu))
+    Kv = times([(1.0, at.of(term.entries))], v)
+    _, joined, _ = at.of(term._pressed)
+    assert joined.several.any()
+    low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
+    assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+
+
+def test_a_step_that_passes_through() -> None:
+    """Walls that change places on the straight way, and walls that only come near."""
+    system, h = ring().model.system, ring().model.material.h
+    here, there, near = (flattened(half, 0.0).reshape(-1, 3) for half in (0.7, -0.7, 0.51))
+    assert touching().through(here, there)
+    assert not touching().through(here, near)
+    assert not touching().through(here, here + 100 * h * np.array([0, 0, 1.0]))
+    assert system.size == here.size
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
+        ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
+        ({"symmetry": "half"}, "symmetry: half: a shell that may touch itself is modelled whole"),
+        ({"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}}, "contact: needs the same thickness everywhere"),
+        ({"loading": {"kind": "time", "duration": 1}}, "kind: time: with contact, steps in time do not know it"),
+        ({"loading": {"kind": "pressure", "until": "limit", "then": "snap"}}, "then: with contact between shells"),
+    ],
+)
+def test_what_is_refused(changed: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said.replace("(", r"\(")):
+        Case.model_validate(RING | changed)

@@ -1,0 +1,102 @@
+"""Sheets of one mesh file that are not connected: they are oriented and held one by one, and pressed together."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sheets import Sheet, write
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.simulate.follow import follow
+
+Array = NDArray[np.float64]
+h = 0.02
+SOFT = 1.0  # foundation, over E/R, which holds what nothing touches yet
+
+
+def pair(folder: Path, below: tuple[int, int], above: tuple[int, int], gap: float = 0.0) -> dict[str, Any]:
+    """Two unit squares whose faces are a gap (over h) apart; both are free to move across."""
+    low = Sheet("lower", (0, 0, 0), (1, 0, 0), (0, 1, 0), below)
+    high = Sheet("upper", (0, 0, (1 + gap) * h), (0, 1, 0), (1, 0, 0), above)  # the other way round
+    file = write(folder / "two.msh", [low, high])
+    edges = {f"{name}_{i}": {"held": ["x", "y"]} for name in ("lower", "upper") for i in range(1, 5)}
+    return {
+        "shell": {
+            "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0
+        },
+        "boundary": edges,
+        "contact": [["upper", "lower"]],
+        "foundation": {"stiffness": SOFT},
+        "mesh": {"degree": 2},
+        "loading": {"kind": "dead", "control": "load", "loads": [], "factor": 1, "points": 1},
+    }  # fmt: skip
+
+
+def pressed(folder: Path, below: tuple[int, int], above: tuple[int, int]) -> tuple[Scene, dict[str, float], Array]:
+    """Pressed together by 0.004 h E/R on both; the scene, what is observed, and the pressures of all cells."""
+    data, p = pair(folder, below, above), 4e-3 * h
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -p]}, {"over": "lower", "per_area": [0, 0, p]}]
+    scene = Scene(Case.model_validate(data))
+    *_, last = follow(scene)
+    (touching,) = scene.model.touchings
+    at = scene.model.system.at(last.point.state)
+    return scene, scene.observe(last.point.state), at.of(touching.of_cells)[0]
+
+
+def test_patch_test_of_equal_meshes(tmp_path: Path) -> None:
+    """The pressure is that of the load less the foundation's, everywhere: 1e-3."""
+    scene, seen, pressure = pressed(tmp_path, (2, 2), (2, 2))
+    deep = -seen["contact_gap_over_h"] * h
+    assert 0 < deep < 1e-3 * h
+    assert np.ptp(pressure) < 1e-3 * pressure.mean()
+    assert pressure.mean() == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=1e-3)
+    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=1e-3)
+
+
+def test_meshes_that_do_not_match(tmp_path: Path) -> None:
+    """In all the force is that of the load, less the foundation's."""
+    scene, seen, pressure = pressed(tmp_path, (2, 2), (3, 2))
+    deep = -seen["contact_gap_over_h"] * h
+    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=2e-3)
+    assert pressure.min() > 0
+
+
+def test_a_piece_that_is_not_held(tmp_path: Path) -> None:
+    data = pair(tmp_path, (1, 1), (1, 1), 1.0)
+    del data["foundation"]
+    data["boundary"] = {"lower_1": "clamped"}
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
+    with pytest.raises(MeshError, match="not held in one of its pieces"):
+        Scene(Case.model_validate(data))
+
+
+def test_pieces_that_overlap(tmp_path: Path) -> None:
+    data = pair(tmp_path, (1, 1), (1, 1), -0.1)
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
+    with pytest.raises(MeshError, match=r"contact: upper and lower overlap undeformed, by 0.1 h at \("):
+        Scene(Case.model_validate(data))
+    data["contact"] = [["upper", "other"]]
+    with pytest.raises(MeshError, match="contact: other: the surface has no such part, only lower, shell, upper"):
+        Scene(Case.model_validate(data))
+
+
+def test_sheets_far_apart(tmp_path: Path) -> None:
+    """Each bends as it does alone: 1e-10."""
+    data = pair(tmp_path, (2, 2), (3, 2), 50.0)
+    del data["foundation"]
+    data["boundary"] = {f"{name}_{i}": "clamped" for name in ("lower", "upper") for i in range(1, 5)}
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-6]}]
+    tips = []
+    for names in (("lower", "upper"), ("upper",)):
+        sheets = [Sheet("lower", (0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 2)),
+                  Sheet("upper", (0, 0, 51 * h), (0, 1, 0), (1, 0, 0), (3, 2))]  # fmt: skip
+        write(tmp_path / "two.msh", [sheet for sheet in sheets if sheet.name in names])
+        alone = data | {"boundary": {k: v for k, v in data["boundary"].items() if k.split("_")[0] in names}}
+        alone |= {"points": {"tip": [0.5, 1 / 3, 51 * h]}, "contact": [["shell", "shell"]]}
+        scene = Scene(Case.model_validate(alone))
+        *_, last = follow(scene)
+        tips.append(scene.observe(last.point.state)["tip_uz"])
+    assert tips[0] == pytest.approx(tips[1], rel=1e-10)

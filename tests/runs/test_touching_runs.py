@@ -1,0 +1,59 @@
+"""Runs in which a shell touches itself: on several ranks, and interrupted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import all_started, magshell, read_path
+from conftest import CASES
+from interrupted import kill, start, wait_for_rows
+
+THICK = [
+    "--set=shell.thickness=0.08",
+    "--set=shell.imperfections=[{kind: formula, w0: 0.3*(x**2 - y**2)}]",
+    "--set=mesh={size: 0.3, degree: 3}",
+    "--set=loading={kind: pressure, until: target, volume_change: -0.26, points: 1}",
+    "--no-pictures",
+]
+PRESSED = 0.19  # 2 p R times the length at the end, in 2 pi D/R
+EXACT = ("p_over_pc", "volume_change", "energy", "contact_force", "contact_gap_over_h")
+
+
+def command(out: Path) -> list[str]:
+    return ["run", str(CASES / "collapsing_tube.yaml"), *THICK, "--out", str(out)]
+
+
+@pytest.mark.slow
+def test_ranks(tmp_path: Path) -> None:
+    """1, 2 and 3: every target to 1e-9 of the largest value on the path.
+
+    Of the contact to 1e-8, its gap over h, and its force, a small difference of two, over the load on a wall.
+    """
+    assert magshell(*command(tmp_path / "1")).returncode == 0
+    for ranks in (2, 3):
+        done = all_started([command(tmp_path / str(ranks))], ranks)
+        assert done.returncode == 0, done.stderr
+    one, *others = (read_path(tmp_path / str(ranks)) for ranks in (1, 2, 3))
+    assert float(one[-1]["contact_force"]) > 0
+    for other in others:
+        assert [row["label"] for row in other] == [row["label"] for row in one]
+        for column in EXACT:
+            a, b = (np.array([float(row[column]) for row in rows if row["label"] == "target"]) for rows in (one, other))
+            largest = np.nanmax(np.abs([float(row[column]) for row in one]))
+            most = {"contact_force": PRESSED, "contact_gap_over_h": 1.0}.get(column, largest)
+            part = 1e-8 if column.startswith("contact") else 1e-9
+            assert a == pytest.approx(b, rel=0, abs=part * most, nan_ok=True), column
+
+
+@pytest.mark.slow
+def test_resume(tmp_path: Path) -> None:
+    """Killed on the way and resumed: the same rows to the last digit."""
+    assert magshell(*command(tmp_path / "whole")).returncode == 0
+    run = start(*command(tmp_path / "killed"))
+    wait_for_rows(run, tmp_path / "killed", 12)
+    kill(run, 0)
+    assert len(read_path(tmp_path / "killed")) < len(read_path(tmp_path / "whole"))
+    assert magshell(*command(tmp_path / "killed"), "--resume").returncode == 0
+    whole, again = (read_path(tmp_path / name) for name in ("whole", "killed"))
+    for column in ("label", *EXACT):
+        assert [row[column] for row in again] == [row[column] for row in whole]
