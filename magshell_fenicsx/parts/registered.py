@@ -25,7 +25,6 @@ KINDS_OF_STEPS: dict[str, str] = {
     # kind -> module here and class in it
     "pressure": "pressure.pressure.PressureSection",
     "indentation": "forces.indentation.IndentationSection",
-    "interaction": "magnetism.interaction.InteractionStep",
     "field": "magnetism.field_step.FieldSection",
     "rotation": "magnetism.field_step.RotationSection",
     "natural": "natural.section.GrowthSection",
@@ -36,6 +35,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "source": "magnetism.source_step.SourceStep",
     "time": "motion.step.TimeSection",
     "spin": "spin.SpinStep",
+    "interaction": "magnetism.interaction.InteractionStep",
 }
 FIRST = ("natural", "interaction", "field")  # the kinds of steps that may come before the one load, in their order
 
