@@ -163,7 +163,7 @@ def test_words_load_no_solver(asked: str) -> None:
 
 
 def test_the_package_is_imported_as_it_is_used() -> None:
-    """Every public name is there, and `run` is the function even after an import of the folder run/."""
+    """Every public name is there, and `run` is the function even after an import of the folder runs/."""
     code = """
 import sys
 import magshell_fenicsx as ms

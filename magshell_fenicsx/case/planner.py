@@ -58,7 +58,7 @@ FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as t
 
 
 def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
-    """Problem a case, with its user-defined energies and `terms`.
+    """The problem of a case, with its user-defined energies and `terms`.
 
     Raises
     ------

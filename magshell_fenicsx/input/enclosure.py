@@ -15,7 +15,6 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-EVERYTHING = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)

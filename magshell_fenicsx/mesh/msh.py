@@ -211,7 +211,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     Raises
     ------
     MeshError
-        If the file cannot be read, or its surface cannot carry a shell; see `soundness`. Places in messages are
+        If the file cannot be read, or its surface cannot carry a shell. Places in messages are
         those of the file.
     """
     try:

@@ -83,7 +83,7 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     Derivatives by the name of the parameter, with all others fixed:
 
     - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
-    - "defect.amplitude", "imperfections.0.width", ...: see `shape_sensitivity`;
+    - "defect.amplitude", "imperfections.0.width", ...: numbers of imperfections;
     - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within a
       dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m times
       the derivative in lambda_m.

@@ -28,7 +28,7 @@ RIGHT = 0.95  # of the bands
 AWAY = 2.0  # standard deviations at which the misfit is compared with its parabola
 LEAST = 1.0  # degree of freedom
 EXACT = 1e-12  # no estimated noise is less than this part of the data
-NORMAL = 0.25  # its relative difference there up to which the posterior counts as normal
+NORMAL = 0.25  # relative difference of both at AWAY up to which the posterior counts as normal
 
 
 class NotSeen(ValueError):

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
+from magshell_fenicsx.parts.touching.section import WHOLE
 from magshell_fenicsx.parts.touching.touching import Pair, Points, Touching
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
-WHOLE = "shell"  # in a pair: all of it
 WITHIN = 1e-6  # penetration over h that is rounding
 
 
@@ -81,6 +81,12 @@ def touchings(
                 there = ", ".join(sorted(named))
                 raise MeshError(f"contact: {name}: the surface has no such part, only {there}")
         one, other = (named[name] for name in pair.names)
+        for before in made:
+            a, b = (named[name] for name in before.pair.names)
+            if ((one & a).any() and (other & b).any()) or ((one & b).any() and (other & a).any()):
+                raise MeshError(
+                    f"contact: {pair.words}: shares cells with {before.pair.words}: no place is in two pairs"
+                )
 
         def allowed(i: Longs, j: Longs, one: Inside = one, other: Inside = other) -> NDArray[np.bool_]:
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Account, Context
-from magshell_fenicsx.parts.touching.touching import Pair
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Material
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
+    from magshell_fenicsx.parts.touching.touching import Pair
 
 WHOLE = "shell"
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
@@ -23,8 +23,10 @@ Pairs = Annotated[
 ]
 
 
-def pairs(given: Sequence[Sequence[str]], material: Material) -> tuple[Pair, ...]:
+def pairs(given: Sequence[Sequence[str]], material: "Material") -> "tuple[Pair, ...]":
     """What a case's pairs are in a model."""
+    from magshell_fenicsx.parts.touching.touching import Pair  # the solver takes long to import
+
     k = STIFF / (12 * (1 - material.nu**2))
     several = len(given) > 1
     return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
@@ -53,6 +55,8 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
         for name in pair:
             if name != WHOLE and not isinstance(context.shell, MeshSurface):
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
+    if len(seen) > 1 and frozenset({WHOLE}) in seen:
+        raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     if context.solid:
         raise ValueError("contact: is of shells: take model: shell")
     if context.shell.thickness_factor is not None:
@@ -77,7 +81,7 @@ def _refuse_step(step: "ProgrammeStep") -> None:
         raise ValueError(f"{step.key}.{key}: with contact between shells it is not built: leave it out")
 
 
-def account(context: Context, loads: Loads) -> Account:
+def account(context: Context, loads: "Loads") -> Account:
     """What may touch, and how stiff it is."""
     return Account(
         [
