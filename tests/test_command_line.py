@@ -168,7 +168,7 @@ def test_the_package_is_imported_as_it_is_used() -> None:
 import sys
 import magshell_fenicsx as ms
 assert "dolfinx" not in sys.modules
-import magshell_fenicsx.runs.status
+import magshell_fenicsx.runs.running, magshell_fenicsx.runs.status
 assert ms.run.__name__ == "run" and "run" in dir(ms)
 slow = {"scipy.optimize", "scipy.interpolate", "scipy.spatial"}  # a quarter of a second of each run
 assert not slow & sys.modules.keys()

@@ -69,7 +69,7 @@ def test_a_piece_that_is_not_held(tmp_path: Path) -> None:
     del data["foundation"]
     data["boundary"] = {"lower_1": "clamped"}
     data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
-    with pytest.raises(MeshError, match="not held in one of its pieces"):
+    with pytest.raises(MeshError, match=r"the shell is not held: .*; this is its piece around"):
         Scene(Case.model_validate(data))
 
 
@@ -80,6 +80,11 @@ def test_pieces_that_overlap(tmp_path: Path) -> None:
         Scene(Case.model_validate(data))
     data["contact"] = [["upper", "other"]]
     with pytest.raises(MeshError, match="contact: other: the surface has no such part, only lower, shell, upper"):
+        Scene(Case.model_validate(data))
+    data = pair(tmp_path, (1, 1), (1, 1), 1.0)
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
+    data["contact"] = [["upper", "lower"], ["upper", "shell"]]
+    with pytest.raises(MeshError, match="contact: upper and shell: shares cells with upper and lower"):
         Scene(Case.model_validate(data))
 
 

@@ -10,10 +10,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -254,7 +254,7 @@ def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs
     """Pairs i != j of spheres that are nearer to each other than a reach, in classes of similar radii."""
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
-    trees = [cKDTree(centres[each]) for each in classes]
+    trees = [scipy.spatial.cKDTree(centres[each]) for each in classes]
     found = list[tuple[Longs, Longs]]()
     for a, first in enumerate(classes):
         for b, second in enumerate(classes):
