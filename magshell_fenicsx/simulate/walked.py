@@ -158,7 +158,7 @@ def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: 
         goal = Goal("points", steps=steps)
     for number, start in enumerate(crossing.starts, 1):
         by_arc = _by_arc(stage, path)
-        walk = _walk(stage, by_arc, start, goal) if stage.scene.model.touchings else Walk(by_arc, start, goal)
+        walk = _walk(stage, by_arc, start, goal)
         watch.begin(by_arc, start, stage.leave, look=True)
         yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
         try:
