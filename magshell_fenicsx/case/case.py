@@ -157,6 +157,10 @@ class Case(WithParts):
             )
         if self.sensors and self.magnetic is None:
             raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
+        if self.magnetic and self.magnetic.interaction != "none" and "symmetry" in self.boundary.conditions().values():
+            raise ValueError(
+                "magnetic.interaction: needs the whole shell: with boundary: symmetry the case is a part of it alone"
+            )
         if self.sensors and "symmetry" in self.boundary.conditions().values():
             raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
         if self.magnetic and self.magnetic.without_field and not self.sensors and self.magnetic.interaction == "none":

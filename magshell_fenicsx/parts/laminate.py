@@ -155,7 +155,7 @@ def laminate_of(shell: Any, turn: float) -> "Laminate | None":
         return None
     direction = section.direction(shell.geometry)
     turned = None if direction is None else rotation(turn) @ direction
-    return Laminate(section.matrices(shell.youngs_modulus or 1.0), turned)
+    return Laminate(section.matrices(shell.youngs_modulus or 1.0), turned, section.isotropic)
 
 
 def laminate_leaves(shell: Any, outline: "Outline") -> list[Leaves]:

@@ -15,6 +15,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.fitted import Cells
@@ -57,6 +58,8 @@ class Observed:
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
     touchings
         The contacts of parts of the shell with each other, or with itself.
+    planes
+        Of symmetry at the edges of a shell.
     growing
         The placement, where imperfections grow.
     axes
@@ -80,6 +83,7 @@ class Observed:
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
     touchings: Sequence[Touching] = ()
+    planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None
     axes: ClassVar[list[int]] = [0, 1, 2]

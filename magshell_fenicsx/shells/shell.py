@@ -21,7 +21,7 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
-from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.mesh.patch import Deviation, MeshError
 from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
@@ -175,6 +175,10 @@ class ShellModel(Thin):
                 continue
             if condition == "plane":
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
+                if material.laminate and not material.laminate.mirrored(plane):
+                    raise MeshError(
+                        f"boundary: {name}: its plane does not mirror the plies, which are neither along nor across it"
+                    )
                 mirrored_edges = factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges")
                 terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
@@ -196,6 +200,7 @@ class ShellModel(Thin):
             held += here
             self.supports[name] = Support.of(here, edge, turn)
         self.supports |= on_planes
+        self.planes = tuple(planes)
         closing = closing_point(planes)
         free_edges, self.without_potential = openings(self.r0, midsurface.edges, conditions)
         closed = enclosed(loads, free_edges, self.without_potential)

@@ -96,6 +96,17 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         return
     ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
     whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
+    x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
+    for plane in model.planes:
+        side = np.sign(comm.allreduce(float(plane.beyond(x0).sum())))
+        near = side * plane.beyond(x0 + ends[1][: model.system.size].reshape(-1, 3)) < h / 2
+        if comm.allreduce(int(np.sum(near & (side * plane.beyond(x0) > h)))):
+            raise PathStopped(
+                "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
+                "model both sides",
+                low,
+                final=True,
+            )
     for each in model.touchings:
         if each.through(*whole):
             raise StepTooLong(f"the shortest step passes {each.pair.words} through each other")

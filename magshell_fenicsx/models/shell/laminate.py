@@ -11,9 +11,11 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor
 
 Array = NDArray[np.float64]
+SAME = 1e-6  # of directions
 Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 22 and 12 of a stress, or twice 12 of a strain
 Stiffness: TypeAlias = Any  # 11, 12, 22, 16, 26, 66: numbers, or an expression (6,)
 
@@ -24,6 +26,17 @@ class Laminate:
 
     matrices: Array = field(repr=False)
     direction: Array | None
+    isotropic: bool = False
+
+    def mirrored(self, plane: Mirror) -> bool:
+        """Whether a plane mirrors plies that do not twist: it is along or across their directions everywhere."""
+        up = abs(float(plane.normal[2]))
+        if self.isotropic:
+            return True
+        if self.direction is None:
+            return up > 1 - SAME or (up < SAME and abs(plane.offset) < SAME)
+        across = abs(float(self.direction @ plane.normal)) / float(np.linalg.norm(self.direction))
+        return min(across, abs(across - 1)) < SAME
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 DEGREES = (3, 5, 7, 10, 14, 20, 30)  # of the rules on triangles that there are
 PRECISION = 1e-5  # of a pair of cells at their distance
+BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
 NOTHING = 1e-13  # of the largest charge: a face or an edge without any
 MOST = 4_000_000  # pairs of charges with second derivatives at once
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
@@ -43,14 +44,21 @@ def degree(distance: Array, size: Array) -> NDArray[np.int8]:
 
     The error of Gauss's rule of degree n falls as rho^-(n + 1), with the sum of half axes rho of the largest ellipse
     around the cell in which the integrand has no pole (Trefethen, Approximation Theory, theorem 19.3).
+
+    Raises
+    ------
+    Touching
+        If cells are too wide for their distance.
     """
     z = 2 * np.maximum(distance / size, SPACE)
     needed = log(1 / PRECISION) / np.log(z + np.sqrt(1 + z**2)) - 1
+    if needed.max(initial=0.0) > BEYOND:
+        raise Touching
     return np.asarray(np.minimum(np.searchsorted(DEGREES, needed), len(DEGREES) - 1), dtype=np.int8)
 
 
 class Touching(ValueError):
-    """Two parts are in each other."""
+    """Two parts are in each other, or nearer than a seventh of the size of their cells."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.shape.sections import MeshSurface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -116,6 +117,20 @@ def refuse_unfit_interaction(context: Context) -> None:
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: how strong it is follows from remanent.flux_density and "
             "shell.youngs_modulus: give both"
+        )
+    if not context.shell.with_units:
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: shell.youngs_modulus has no unit: give it in pascals, and "
+            "lengths in units"
+        )
+    if not isinstance(context.shell, MeshSurface):
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file that are not connected: "
+            "take geometry: mesh, or interaction: none"
+        )
+    if context.shell.law != "koiter":
+        raise CaseError(
+            f"magnetic.interaction: {magnetic.interaction}: is of a thickness that does not change: take law: koiter"
         )
     if context.solid:
         raise CaseError(

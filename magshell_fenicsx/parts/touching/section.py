@@ -61,6 +61,8 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
         raise ValueError("contact: is of shells: take model: shell")
     if context.shell.thickness_factor is not None:
         raise ValueError("contact: needs the same thickness everywhere: leave out shell.thickness_factor")
+    if context.shell.law != "koiter":
+        raise ValueError(f"contact: with shell.law: {context.shell.law}, which makes the shell thinner, is not built")
     if symmetry in ("half", "axisymmetric"):
         raise ValueError(
             f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "
@@ -76,6 +78,8 @@ def _refuse_step(step: "ProgrammeStep") -> None:
     for kind, why in (("time", "steps in time do not know it"), ("imperfection", "the undeformed gaps would change")):
         if step.kind == kind:
             raise ValueError(f"{step.key}.kind: {kind}: with contact, {why}: take steps along a path")
+    if getattr(step.load, "search", None):
+        raise ValueError(f"{step.key}.search: with contact between shells it is not built: leave it out")
     if getattr(step.load, "then", None) or getattr(step.load, "sensitivities", False):
         key = "then" if getattr(step.load, "then", None) else "sensitivities"
         raise ValueError(f"{step.key}.{key}: with contact between shells it is not built: leave it out")

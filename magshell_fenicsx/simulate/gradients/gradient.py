@@ -206,6 +206,8 @@ def gradient(
 
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
     """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number` for `others`."""
+    if adjoint.scene.model.touchings:
+        raise CaseError(f"{by}: of shells that may touch each other gradients are not built")
     size = adjoint.size
     if by in FIELDS:
         found = by_field(adjoint, by)
