@@ -49,6 +49,13 @@ loading: {kind: field, points: 4}
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 
 
+@pytest.fixture(autouse=True)
+def _no_reminders(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Studies say no more than their lines, however slow the machine is."""
+    if request.path.parent.name == "studies":
+        monkeypatch.setattr("magshell_fenicsx.studies.runner.EACH", 3600.0)
+
+
 def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None) -> Midsurface:
     """A coarse hemisphere; the size holds everywhere."""
     points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}

@@ -39,8 +39,8 @@ def test_case_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("line", "offers"),
     [
         ("magshell ex", ["example"]),
-        ("magshell run cases/snap_", ["cases/snap_back.yaml"]),
-        ("magshell example snap_", ["snap_back"]),
+        ("magshell run cases/snap_", ["cases/snap_back.yaml", "cases/snap_map.yaml"]),
+        ("magshell example snap_", ["snap_back", "snap_map"]),
         ("magshell plot resu", []),
         ("magshell run cases/snap_back.yaml --out resu", []),
     ],

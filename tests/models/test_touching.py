@@ -150,6 +150,11 @@ def test_a_step_that_passes_through() -> None:
         ({"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}}, "contact: needs the same thickness everywhere"),
         ({"loading": {"kind": "time", "duration": 1}}, "kind: time: with contact, steps in time do not know it"),
         ({"loading": {"kind": "pressure", "until": "limit", "then": "snap"}}, "then: with contact between shells"),
+        ({"loading": {"kind": "pressure", "search": {}}}, "search: with contact between shells"),
+        (
+            {"shell": {**RING["shell"], "law": "neo-hookean", "poisson_ratio": 0.5}},
+            "contact: with shell.law: neo-hooke",
+        ),
     ],
 )
 def test_what_is_refused(changed: dict[str, Any], said: str) -> None:

@@ -8,6 +8,7 @@ import pytest
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.opened import changed
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.simulate.numbers import number_of
 
@@ -131,6 +132,9 @@ def test_what_is_refused() -> None:
         case(shell=shell, boundary={"rim": "clamped"}, loading=PRESSED)
     with pytest.raises(CaseError, match="no plane mirrors a laminate that twists"):
         case(shell=STRIP | {"laminate": {"plies": plies(20)}}, boundary=SIDES, loading=PRESSED)
+    askew = {"laminate": {"plies": plies(0), "along": [1, 1, 0]}}
+    with pytest.raises(MeshError, match="boundary: bottom: its plane does not mirror the plies"):
+        ms.Scene(case(shell=STRIP | askew, boundary=SIDES, loading=PRESSED))
     with pytest.raises(CaseError, match=r"shell\.laminate: is of a shell"):
         pressed({"plies": plies(0)}, model="solid")
     for laminate, message in (

@@ -31,6 +31,12 @@ def points(file: Path, *over: str) -> list[SweepPoint]:
     return make_points(file, parse_axes(over))
 
 
+def test_what_acts_without_a_field_makes_points_differ() -> None:
+    """The remanence of a shell that a sensor reads."""
+    first, second = points(CASES / "hall_sensor.yaml", "magnetic.remanent.flux_density=10 mT,20 mT")
+    assert first.key != second.key
+
+
 def read(file: Path) -> list[dict[str, str]]:
     with file.open(encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
