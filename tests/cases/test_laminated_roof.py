@@ -14,7 +14,7 @@ from magshell_fenicsx.public import run
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("angles", "thickness", "size"),
-    [((0, 90, 0), 12.7, 64), ((90, 0, 90), 12.7, 64), ((0, 90, 0), 6.35, 32), ((90, 0, 90), 6.35, 24)],
+    [((0, 90, 0), 12.7, 64), ((90, 0, 90), 12.7, 64), ((0, 90, 0), 6.35, 32)],
 )
 def test_whole_curve(angles: tuple[int, ...], thickness: float, size: float) -> None:
     """Through their folds, within 1 % of the largest displacement and of the largest load.

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from magshell_fenicsx.parts.laminate import Laminate, LaminateSection
+from magshell_fenicsx.models.shell.laminate import Laminate
+from magshell_fenicsx.parts.laminate import LaminateSection
 
 
 def ply(
