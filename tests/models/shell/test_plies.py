@@ -10,10 +10,10 @@ from conftest import disc, hemisphere, random_displacement
 from plies import laminate, ply, section
 
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.models.shell.laminate import Laminate
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.output.fields.point_fields import Stresses
-from magshell_fenicsx.parts.laminate import Laminate
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.shape import Natural, meridians
 from magshell_fenicsx.shells.meridian import MeridianModel
