@@ -55,7 +55,7 @@ def test_the_test_of_triangles() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 def test_nothing_passes_through(tmp_path: Path, seed: int) -> None:
     """Two cantilevers, held at opposite ends, are pushed past each other if contact did not keep them apart."""
     rng = np.random.default_rng(seed)
