@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Held, Material, default_penalty
-from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place
+from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place, places
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import (
@@ -122,6 +122,8 @@ class ShellModel(Thin):
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         in_cells = cells_of(self.r0)
+        if material.laminate:
+            material.laminate.refuse_normal(places(self.r0)[1], midsurface.mesh.comm)
         for name in ("magnetic", "remanence"):
             if (field := getattr(loads, name)) and field.given:
                 vectors = carried(field.given, midsurface, in_cells)

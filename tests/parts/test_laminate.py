@@ -135,6 +135,9 @@ def test_what_is_refused() -> None:
     askew = {"laminate": {"plies": plies(0), "along": [1, 1, 0]}}
     with pytest.raises(MeshError, match="boundary: bottom: its plane does not mirror the plies"):
         ms.Scene(case(shell=STRIP | askew, boundary=SIDES, loading=PRESSED))
+    upright = {"laminate": {"plies": plies(0), "along": [0, 0, 1]}}
+    with pytest.raises(MeshError, match="along: is normal to a part of the shell"):
+        ms.Scene(case(shell=STRIP | upright, boundary={"left": "clamped"}, loading=PRESSED))
     with pytest.raises(CaseError, match=r"shell\.laminate: is of a shell"):
         pressed({"plies": plies(0)}, model="solid")
     for laminate, message in (

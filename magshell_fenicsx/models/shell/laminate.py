@@ -9,9 +9,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self, TypeAlias
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor
 
 Array = NDArray[np.float64]
@@ -27,6 +29,22 @@ class Laminate:
     matrices: Array = field(repr=False)
     direction: Array | None
     isotropic: bool = False
+
+    def refuse_normal(self, normals: Array, comm: MPI.Comm) -> None:
+        """See that the direction has a part in each cell, whose normals are (cells, nodes, 3); collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if it is normal to a whole cell.
+        """
+        if self.direction is None or self.isotropic:
+            return
+        within = np.linalg.norm(np.cross(normals, self.direction / np.linalg.norm(self.direction)), axis=-1)
+        if comm.allreduce(float(within.max(axis=1).min(initial=1.0)), MPI.MIN) < SAME:
+            raise MeshError(
+                "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no direction"
+            )
 
     def mirrored(self, plane: Mirror) -> bool:
         """Whether a plane mirrors plies that do not twist: it is along or across their directions everywhere."""
