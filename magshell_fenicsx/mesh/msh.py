@@ -39,7 +39,7 @@ TIE = 1e-6  # of the area: a difference that decides nothing
 
 
 def oriented(nodes: Array, cells: Cells) -> Cells:
-    """The triangles (m, 3 | 6 | 10) of each piece in one orientation, that of its larger area, or of a rule.
+    """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger area, or of a rule.
 
     Raises
     ------

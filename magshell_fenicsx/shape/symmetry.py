@@ -129,8 +129,7 @@ def of_shape(shell: "ShellSection | Surface", outline: "Outline") -> Leaves:
     def mirrors(mirror: Mirror) -> bool:
         if not isinstance(factor, str):
             return not isinstance(factor, GivenField)  # patches are mapped onto themselves
-        x = outline.sample()
-        return alike(formula(factor)(*x.T), formula(factor)(*mirror.image(x).T))
+        return mirrors_formula(factor, mirror, outline.sample())
 
     reason = None
     if not outline.round:
@@ -154,6 +153,12 @@ def of_points(points: Iterable[Sequence[float]], R: float, outline: "Outline") -
         return chosen or all(float(mirror.beyond(x)) > -ROUNDING for x in places)
 
     return Leaves(mirrors=within)
+
+
+def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) -> bool:
+    """Whether a formula is the same at places (n, 3) over R and at their images; `length` is R in its unit."""
+    of = formula(text)
+    return alike(of(*(length * x).T), of(*(length * mirror.image(x)).T))
 
 
 def alike(here: Array, there: Array) -> bool:

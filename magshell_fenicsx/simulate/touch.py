@@ -97,10 +97,11 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
     whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
     x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
+    x = x0 + ends[1][: model.system.size].reshape(-1, 3)
     for plane in model.planes:
-        side = np.sign(comm.allreduce(float(plane.beyond(x0).sum())))
-        near = side * plane.beyond(x0 + ends[1][: model.system.size].reshape(-1, 3)) < h / 2
-        if comm.allreduce(int(np.sum(near & (side * plane.beyond(x0) > h)))):
+        before, after = plane.beyond(x0), plane.beyond(x)
+        side = np.sign(comm.allreduce(float(before.sum())))
+        if comm.allreduce(int(np.sum((side * before > h) & (side * after < h / 2)))):
             raise PathStopped(
                 "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
                 "model both sides",

@@ -24,7 +24,7 @@ from magshell_fenicsx.input.expressions import function
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
-from magshell_fenicsx.shape.symmetry import Leaves, alike
+from magshell_fenicsx.shape.symmetry import Leaves, mirrors_formula
 from magshell_fenicsx.shape.turning import scalar_turns
 
 if TYPE_CHECKING:
@@ -78,8 +78,7 @@ class ByPlace:
 
     def mirrored(self, mirror: Mirror, outline: "Outline") -> bool:
         """Whether a plane mirrors it."""
-        x = outline.sample()
-        return alike(self.of_place(*x.T), self.of_place(*mirror.image(x).T))
+        return mirrors_formula(self.text, mirror, outline.sample())
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """How thick a shell is that keeps its volume: over its undeformed thickness, as an expression and at points.
 
 Bodies touch its faces, which come nearer to each other as the surface stretches; a natural shape is what has grown
-without stress, of which the volume stays.
+without stress, and its volume stays.
 """
 
 from collections.abc import Callable

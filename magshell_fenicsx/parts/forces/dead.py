@@ -21,7 +21,7 @@ from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.shape.symmetry import Leaves, alike, tilted, unit
+from magshell_fenicsx.shape.symmetry import Leaves, alike, mirrors_formula, tilted, unit
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 
 if TYPE_CHECKING:
@@ -199,13 +199,8 @@ class DeadSection(PathStep):
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)
-            image = mirror.image(x)
-            alike_there = (alike(of(*(R * x).T), of(*(R * image).T)) for of in map(function, potentials))
-            return (
-                on_plane
-                and all(alike_there)
-                and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
-            )
+            in_potentials = on_plane and all(mirrors_formula(text, mirror, x, R) for text in potentials)
+            return in_potentials and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
 
         why = "a patch is loaded" if patches else None
         if any(tilted(v) for v in vectors):
@@ -238,7 +233,7 @@ class DeadSection(PathStep):
                 values = value if isinstance(value, list) else [value]
                 most = LARGEST * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
-            if load.potential:  # of the deformed place, of which the first is looked at
+            if load.potential:  # of the deformed place: the undeformed one is looked at
                 most = LARGEST * scales.E * scales.h
                 yield Formulas(f"{key}.loads.{i}.potential", [load.potential], -most, most, scales.R, deformed=True)
 

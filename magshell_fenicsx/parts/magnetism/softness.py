@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.expressions import ByFormula, formula, function
+from magshell_fenicsx.input.expressions import ByFormula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
@@ -18,7 +18,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import alike
+from magshell_fenicsx.shape.symmetry import mirrors_formula
 
 Array = NDArray[np.float64]
 PLACES = 50  # on each rank, where two fields are compared
@@ -47,10 +47,7 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
     """Whether a plane mirrors a susceptibility; patches are mapped onto themselves."""
-    if not isinstance(chi, str):
-        return True
-    x = outline.sample()
-    return alike(formula(chi)(*x.T), formula(chi)(*mirror.image(x).T))
+    return not isinstance(chi, str) or mirrors_formula(chi, mirror, outline.sample())
 
 
 def parity(sight: Sight, field: Magnetisation, state: State, mirror: Mirror) -> float:
