@@ -98,18 +98,21 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """The load column of lambda_m for a problem whose field is zero: of the same shell with a field.
+    """The load column of lambda_m for a problem whose field is zero: the slope of the magnetic energy in it.
 
     Empty without a section magnetic, and where the field leaves less symmetry than the model has.
     """
-    if scene.problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
+    problem = scene.problem
+    if problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
     none = dict.fromkeys(("magnetic.remanent.flux_density", "magnetic.applied.flux_density"))
-    there = Scene(scene.problem.again({"magnetic.lambda_m": SOME_FIELD, **none}), scene.comm)
-    if type(there.model) is not type(scene.model) or there.model.system.size != scene.model.system.size:
-        return {}
+    there = problem.again({"magnetic.lambda_m": SOME_FIELD, **none})
+    whole = not problem.axisymmetric and problem.mirror is None
+    alike = (there.axisymmetric, there.mirror) == (problem.axisymmetric, problem.mirror)
+    assert there.loads.magnetic
     size = scene.model.system.size
-    return {"lambda_m": there.model.system.load(state.u[:size], {**there.unloaded().mu, **state.mu}, "lambda_m")}
+    own = State(state.u[:size], state.mu)
+    return {"lambda_m": _magnetic_column(scene, own, there.loads.magnetic)} if whole or alike else {}
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         return {}
     within, one = scene.problem.within, np.ones(3)
     if not within:
-        return {"remanence": _magnetic_column(scene, fold, field)}
+        return {"remanence": _magnetic_column(scene, fold.state, field)}
 
     def only(patch: str) -> WithinRims:
         rims = tuple((inside, one if name == patch else 0 * one) for name, inside in within.items())
@@ -139,21 +142,22 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
     patches = {patch: only(patch) for patch in (*within, "rest")}
     return {
-        f"remanence {name}": _magnetic_column(scene, fold, replace(field, remanent=_Within(field.remanent, patch)))
+        f"remanence {name}": _magnetic_column(scene, fold.state, replace(field, remanent=_Within(field.remanent, patch)))
         for name, patch in patches.items()
     }
 
 
-def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
+def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
+    """lambda_m dPi/du of a field; dPi/du where the problem has none."""
     model, system = scene.model, scene.model.system
-    column, terms = fem.Function(model.V), magnetic_terms(scene, fold.state, field)
+    column, terms = fem.Function(model.V), magnetic_terms(scene, state, field)
 
     def add() -> None:
         for term in terms:
             assert term.amplitude
-            term.add_residual(column.x.array, fold.state.mu[term.amplitude])
+            term.add_residual(column.x.array, state.mu.get(term.amplitude, 1.0))
 
-    system.at(fold.state).of(add)
+    system.at(state).of(add)
     column.x.scatter_reverse(InsertMode.add)
     for held in system.clamped:
         held.set(column.x.array)
@@ -164,7 +168,7 @@ def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence
     """The model's terms of a remanence with another one, in the fields of a state; none of what is soft alone."""
     terms, fields = _made(scene, field)
     for known in fields:
-        known.mu.update({name: state.mu[name] for name in known.names})
+        known.mu.update({name: state.mu.get(name, 0.0) for name in known.names})
     return terms
 
 
