@@ -140,9 +140,11 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         rims = tuple((inside, one if name == patch else 0 * one) for name, inside in within.items())
         return WithinRims(rims, one if patch == "rest" else 0 * one)
 
-    patches = {patch: only(patch) for patch in (*within, "rest")}
+    alone = {patch: _Within(field.remanent, only(patch)) for patch in (*within, "rest")}
     return {
-        f"remanence {name}": _magnetic_column(scene, fold.state, replace(field, remanent=_Within(field.remanent, patch)))
+        f"remanence {name}": _magnetic_column(
+            scene, fold.state, replace(field, remanent=_Within(field.remanent, patch))
+        )
         for name, patch in patches.items()
     }
 
