@@ -142,10 +142,8 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
     alone = {patch: _Within(field.remanent, only(patch)) for patch in (*within, "rest")}
     return {
-        f"remanence {name}": _magnetic_column(
-            scene, fold.state, replace(field, remanent=_Within(field.remanent, patch))
-        )
-        for name, patch in patches.items()
+        f"remanence {patch}": _magnetic_column(scene, fold.state, replace(field, remanent=remanence))
+        for patch, remanence in alone.items()
     }
 
 
