@@ -43,10 +43,13 @@ def kept_file(name: str) -> Path | None:
 def trusted(file: Path) -> bool:
     """Whether there is such a file, of the user or root, that nobody else may change."""
     try:
-        about = file.stat()
+        return _is_trusted(file.stat())
     except OSError:
         return False
-    return about.st_uid in (0, os.getuid()) and not _writable_by_others(about)
+
+
+def _is_trusted(about: os.stat_result | None) -> bool:
+    return about is not None and about.st_uid in (0, os.getuid()) and not _writable_by_others(about)
 
 
 def recall(name: str) -> bytes | None:
@@ -104,23 +107,34 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
-    there = sorted(folder.glob(f"{FORMS}*"))
-    strange = {file.name.split(".")[0] for file in there if not trusted(file)}
-    with suppress(OSError):
-        late = time.time() - UNFINISHED
-        strange |= {
-            file.stem
-            for file in folder.glob(f"{FORMS}*.c")
-            if file.stat().st_mtime < late and not file.with_suffix(".c.cached").exists()
-        }
-    for file in there:
-        if file.name.split(".")[0] in strange:
-            file.unlink(missing_ok=True)
+    forms, late = _forms(folder), time.time() - UNFINISHED
+    strange = {
+        name.split(".")[0]
+        for name, about in forms.items()
+        if not _is_trusted(about)
+        or (about and name.endswith(".c") and about.st_mtime < late and f"{name}.cached" not in forms)
+    }
+    for name in forms:
+        if name.split(".")[0] in strange:
+            (folder / name).unlink(missing_ok=True)
     for other in also:
-        for file in other.glob(f"{FORMS}*") if other != folder else ():
-            if trusted(file):
+        for name, about in _forms(other).items() if other != folder else ():
+            if _is_trusted(about):
                 with suppress(FileExistsError):
-                    (folder / file.name).symlink_to(file)
+                    (folder / name).symlink_to(other / name)
+
+
+def _forms(folder: Path) -> dict[str, os.stat_result | None]:
+    """The files of dolfinx's forms in a folder, of which there may be thousands; None for a link that leads nowhere."""
+    forms = dict[str, os.stat_result | None]()
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.startswith(FORMS):
+                try:
+                    forms[entry.name] = entry.stat()
+                except OSError:
+                    forms[entry.name] = None
+    return forms
 
 
 def _candidates(usual: Path) -> Iterator[Path]:
@@ -137,9 +151,7 @@ def _is_private(folder: Path) -> bool:
     """Whether nobody but the user and root may change what is in a folder, or put another in its place."""
     folder = folder.resolve()
     about = folder.stat()
-    if about.st_uid not in (0, os.getuid()) or _writable_by_others(about):
-        return False
-    return all(_keeps(parent.stat()) for parent in folder.parents)
+    return _is_trusted(about) and all(_keeps(parent.stat()) for parent in folder.parents)
 
 
 def _keeps(about: os.stat_result) -> bool:
