@@ -111,19 +111,20 @@ def run(
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.opened import opened
-    from magshell_fenicsx.output.report.verdict import sentence_of
+
+    folder = chosen_folder(out, case.stem)
+    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
+    with exit_codes():
+        read = opened(case, world(), set_ or [])
+    from magshell_fenicsx.output.report.verdict import sentence_of  # what solves: a refused case does without
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
     from magshell_fenicsx.public import run as run_case
     from magshell_fenicsx.runs.files import AlreadyComplete
 
-    folder = chosen_folder(out, case.stem)
-    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
-        with exit_codes(stopped=(DiskError,)):
-            read = opened(case, world(), set_ or [])
-            with live_line(world().size, print_line) as (say, tell):
-                result = run_case(read, folder, say=say, tell=tell, **how)
+        with exit_codes(stopped=(DiskError,)), live_line(world().size, print_line) as (say, tell):
+            result = run_case(read, folder, say=say, tell=tell, **how)
     except AlreadyComplete as e:
         print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         print_line(sentence_of(folder))

@@ -151,15 +151,25 @@ def test_version() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, f"magshell_fenicsx {__version__}\n", "")
 
 
-@pytest.mark.parametrize("asked", ["--version", "--help", "example", "schema"])
+REFUSED = f"run {CASES / 'dimple_buckling.yaml'} --set shell.poisson_ratio=9"
+
+
+@pytest.mark.parametrize("asked", ["--version", "--help", "example", "schema", REFUSED])
 def test_words_load_no_solver(asked: str) -> None:
-    """They would take seconds. The schema has the keys of parts, whose energies are written in UFL."""
-    code = "import sys; from magshell_fenicsx.cli import app; app(sys.argv[1:], standalone_mode=False)"
-    code += "; print(*sys.modules)"
-    told = subprocess.run([sys.executable, "-c", code, asked], capture_output=True, text=True, check=True).stdout
-    solvers = {"dolfinx", "petsc4py", "scipy"} | ({"ufl"} if asked != "schema" else set())
+    """They would take seconds. Schema and cases have the keys of parts, whose energies are written in UFL."""
+    code = """
+import sys
+from magshell_fenicsx.cli import app
+try:
+    app(sys.argv[1:])
+finally:
+    print(*sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code, *asked.split()], capture_output=True, text=True, check=False)
+    assert done.returncode == (2 if asked == REFUSED else 0)
+    solvers = {"dolfinx", "petsc4py", "scipy"} | ({"ufl"} if asked not in ("schema", REFUSED) else set())
     solvers |= {"rich"} if asked != "--help" else set()  # a seventh of a second
-    assert not solvers & set(told.splitlines()[-1].split())
+    assert not solvers & set(done.stdout.splitlines()[-1].split())
 
 
 def test_the_package_is_imported_as_it_is_used() -> None:

@@ -15,7 +15,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.processes import from_first
-from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.problem.sizes import MeshSection
 
 
@@ -71,16 +70,6 @@ def _content(reader: FileKeys) -> bytes | OSError:
         return reader.files.content(reader.path)
     except OSError as e:
         return e
-
-
-def document_of(case: Case) -> Document:
-    """What a run writes of a case."""
-    return Document(
-        data=case.model_dump(mode="json", exclude_none=True),
-        name=case.file_name,
-        outside=case.outside,
-        placed=case.placed,
-    )
 
 
 def changed(case: Case, values: Mapping[str, Any]) -> Case:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import changed, document_of, perfect_case
+from magshell_fenicsx.case.opened import changed, perfect_case
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading, Squares
@@ -45,7 +45,7 @@ from magshell_fenicsx.problem.formulas import (
 )
 from magshell_fenicsx.problem.limits import unknowns_of
 from magshell_fenicsx.problem.names import refuse_unfit_ends, surface_terms
-from magshell_fenicsx.problem.problem import Awaited, Problem, body_of
+from magshell_fenicsx.problem.problem import Awaited, Document, Problem, body_of
 from magshell_fenicsx.problem.sizes import Loaded, grading
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
@@ -181,6 +181,16 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     )
     refuse_twice(problem)
     return problem
+
+
+def document_of(case: Case) -> Document:
+    """What a run writes of a case."""
+    return Document(
+        data=case.model_dump(mode="json", exclude_none=True),
+        name=case.file_name,
+        outside=case.outside,
+        placed=case.placed,
+    )
 
 
 def _awaited(case: Case) -> Awaited | None:

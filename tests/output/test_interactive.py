@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.opened import document_of
+from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_point

@@ -16,7 +16,7 @@ from test_sweep import plate
 
 import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import document_of
+from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.known import GROUPS, PHASES
