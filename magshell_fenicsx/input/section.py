@@ -254,6 +254,11 @@ def _example(unit: str) -> str:
 
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
+Lengths = Annotated[
+    list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)
+]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 FluxDensity = Annotated[float, _quantity("tesla")]
 Density = Annotated[float, _quantity("kilogram/metre**3")]
 

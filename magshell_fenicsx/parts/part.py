@@ -1,6 +1,6 @@
 """The base of parts: sections of a case that add energies."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
@@ -240,6 +240,23 @@ Offer = Literal[
 ]
 
 
+@dataclass(frozen=True)
+class InTime:
+    """A load that may be a function of time, though no step drives it: its name in `history`.
+
+    Attributes
+    ----------
+    with_units
+        Whether its values may have a unit.
+    refused
+        Why it may not be one here; empty if it may.
+    """
+
+    name: str
+    with_units: bool
+    refused: str
+
+
 class Ability:
     """What adds something to a problem, mostly a section of the case file; by default it adds nothing.
 
@@ -267,6 +284,10 @@ class Ability:
     def lengths(self, data: Mapping[str, Any]) -> Iterable[str]:
         """The keys of its plain data, in that of the case, that are text with a unit of length."""
         return []
+
+    def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
+        """Its load that may be a function of time, after steps that have driven amplitudes; None without."""
+        return None
 
     def patches(self) -> dict[str, Iterable[str]]:
         """Its keys with values by patch -> the names of these."""

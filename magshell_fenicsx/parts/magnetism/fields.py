@@ -1,6 +1,6 @@
 """The magnetisation and the applied field."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from math import isnan, pi, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -15,7 +15,7 @@ from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrO
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
-from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
+from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.quantities.quantity import Given, Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.sections import MeshSurface, SurfaceSection
@@ -30,6 +30,7 @@ SOURCES = 1e-9  # of the field's derivatives: rounding
 LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
 MOST_SOFT = 1e6  # of a susceptibility
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
+ANGLE = "angle"  # amplitude of a step that turns the field
 INDUCED = tuple(f"induced_{axis}" for axis in "xyz")
 register(
     tuple(
@@ -340,6 +341,12 @@ class MagneticSection(Section, Ability):
         patches = self.remanent.patches if self.remanent else None
         if patches and "rest" not in patches and not isinstance(shell, MeshSurface):
             raise ValueError("magnetic.remanent: patches needs the patch rest")
+
+    def in_time(self, context: Context, driven: Collection[str]) -> InTime:
+        why = "not after kind: rotation" if ANGLE in driven else ""
+        if not strength(context):
+            why = "needs magnetic.lambda_m, not zero"
+        return InTime("field", self.applied.flux_density not in (None, 0.0), why)
 
     def patches(self) -> dict[str, Iterable[str]]:
         values = {

@@ -84,6 +84,12 @@ class PressureSeen(Seen):
             return None
         return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
 
+    def left_out(self, sight: Sight) -> list[str]:
+        from magshell_fenicsx.parts.pressure.openings import no_potential  # the solver takes long to import
+
+        open_at = sight.model.without_potential if sight.loads.pressure else ()
+        return [no_potential(open_at)] if open_at else []
+
 
 def account(context: Context, loads: "Loads") -> Account:
     """Whether there is a live pressure."""
