@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -325,6 +325,25 @@ class Ability:
     def units(self, context: Context, units: Given) -> Given:
         """The sizes of units, with those that it gives."""
         return units
+
+
+@dataclass(frozen=True)
+class KeyAbility(Ability, Generic[Kind]):
+    """One whose key has a list or a mapping, of which none is empty.
+
+    Attributes
+    ----------
+    given
+        What stands at the key.
+    """
+
+    key: ClassVar[str]
+    given: Kind
+
+    @classmethod
+    def of(cls, context: Context) -> Self | None:
+        given = context.sections.get(cls.key)
+        return cls(given) if given else None
 
 
 class Part(Section, Ability):

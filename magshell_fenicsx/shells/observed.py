@@ -1,7 +1,8 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -91,6 +92,11 @@ class Observed:
     thickness: fem.Function | None = None
     midsurface: Midsurface | None = None
 
+    @cached_property
+    def kept(self) -> dict[type, Any]:
+        """What rooms of parts keep with the model, by its class."""
+        return {}
+
     @property
     def mirrored_facets(self) -> Facets:
         """The edges on the mirror plane of a half model; none of another."""
@@ -144,7 +150,7 @@ class Observed:
         rows[np.arange(3), dofs] = 1.0
         return rows
 
-    def touching(self, state: State, approach: str) -> Region:
+    def region(self, state: State, approach: str) -> Region:
         """Where a body touches."""
         pressing, forms = self.contacts[approach]
         at = self.system.at(state)

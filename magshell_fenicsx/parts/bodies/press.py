@@ -161,7 +161,7 @@ class BodiesSeen(Seen):
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         model, h, values = sight.model, sight.h, dict[str, float]()
         for name in model.contacts:
-            at, force = model.touching(state, name), sight.potential(state, name)
+            at, force = model.region(state, name), sight.potential(state, name)
             numbers = (state.mu[name], -force / self._unit(sight), at.penetration / h)
             radii = (sight.length * radius for radius in (at.radius, at.inner, at.outer))
             k = float(model.contacts[name][0].stiffness.value)

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, Validati
 from magshell_fenicsx.input.section import Section, in_units, lengths_with_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.shape.ground import At, Distance, Ground, located
 
 Array = NDArray[np.float64]
@@ -283,16 +283,10 @@ def _refuse_steep(depth: float, slope: float) -> None:
         raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
 
 
-@dataclass(frozen=True)
-class Imperfect(Ability):
+class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
     """All imperfections of a case, by their keys below `shell`."""
 
-    sections: Mapping[str, ImperfectionSection]
-
-    @classmethod
-    def of(cls, context: Context) -> "Imperfect | None":
-        sections = context.sections.get("imperfections")
-        return cls(sections) if sections else None
+    key = "imperfections"
 
     def refuse_unfit(self, context: Context) -> None:
         """See that the shell can have them."""
@@ -300,7 +294,7 @@ class Imperfect(Ability):
         if getattr(shell, "defect", None) and shell.imperfections:
             raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
         edge = None if shell.edge_polar is None else radians(shell.edge_polar)
-        for key, section in self.sections.items():
+        for key, section in self.given.items():
             try:
                 section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
             except ValueError as e:
@@ -310,7 +304,7 @@ class Imperfect(Ability):
         written = {f"imperfections.{i}": item for i, item in enumerate(data["shell"].get("imperfections") or [])}
         written |= {"defect": item} if (item := data["shell"].get("defect")) else {}
         for key, item in written.items():
-            yield from lengths_with_units(type(self.sections[key]), item, f"shell.{key}.")
+            yield from lengths_with_units(type(self.given[key]), item, f"shell.{key}.")
 
 
 def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:

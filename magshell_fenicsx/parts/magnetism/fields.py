@@ -16,8 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
-from magshell_fenicsx.quantities.quantity import Given, Quantity
-from magshell_fenicsx.quantities.registry import register
+from magshell_fenicsx.quantities.quantity import Given
 from magshell_fenicsx.shape.sections import MeshSurface, SurfaceSection
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
@@ -31,19 +30,6 @@ LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
 MOST_SOFT = 1e6  # of a susceptibility
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 ANGLE = "angle"  # amplitude of a step that turns the field
-INDUCED = tuple(f"induced_{axis}" for axis in "xyz")
-register(
-    tuple(
-        Quantity(
-            name,
-            f"induced polarisation along e{number}",
-            f"Mean over the soft shell of the polarisation μ0 M that the field induces, along e{number}; in T, without "
-            "units over that of λ_m = 1.",
-            "load",
-        )
-        for number, name in enumerate(INDUCED, 1)
-    )
-)
 
 
 class Layer(Direction):

@@ -13,7 +13,7 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
-from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 
@@ -87,16 +87,10 @@ def units(context: Context) -> tuple[float, float]:
     return (Br, magnetic.tesla(E)) if Br and E else (Br or 1.0, nan)
 
 
-@dataclass(frozen=True)
-class Sensing(Ability):
+class Sensing(KeyAbility[Mapping[str, SensorSection]]):
     """All sensors of a case."""
 
-    sensors: Mapping[str, SensorSection]
-
-    @classmethod
-    def of(cls, context: Context) -> "Sensing | None":
-        given = context.sections.get("sensors")
-        return cls(given) if given else None
+    key = "sensors"
 
     def refuse_unfit(self, context: Context) -> None:
         """See that something is magnetised, whose field can be read."""
@@ -108,7 +102,7 @@ class Sensing(Ability):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """See that no sensor is in the undeformed shell."""
-        for name, each in self.sensors.items():
+        for name, each in self.given.items():
             if not name.isidentifier():
                 raise CaseError(
                     f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns"

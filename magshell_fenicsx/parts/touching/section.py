@@ -1,12 +1,11 @@
 """The key `contact`: which shells may touch, and what a case with it can be."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.part import Ability, Account, Context, Modelled
+from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
@@ -24,16 +23,10 @@ Pairs = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class ShellContact(Ability):
+class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
     """All pairs of a case that may touch."""
 
-    given: Sequence[Sequence[str]]
-
-    @classmethod
-    def of(cls, context: Context) -> "ShellContact | None":
-        given = context.sections.get("contact")
-        return cls(given) if given else None
+    key = "contact"
 
     def refuse_unfit(self, context: Context) -> None:
         refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
