@@ -30,13 +30,8 @@ from magshell_fenicsx.parts.touching.section import Pairs
 from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.sections import (
-    CapSurface,
-    MeshSurface,
-    RevolutionSurface,
-    ShellSection,
-    Surface,
-)
+from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface
+from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 

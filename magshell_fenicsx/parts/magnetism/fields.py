@@ -17,7 +17,8 @@ from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.quantities.quantity import Given
-from magshell_fenicsx.shape.sections import MeshSurface, SurfaceSection
+from magshell_fenicsx.shape.revolved import SurfaceSection
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
-from magshell_fenicsx.shape.sections import CapSurface, ShellSection, Surface
+from magshell_fenicsx.shape.revolved import CapSurface
+from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
 
