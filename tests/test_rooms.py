@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import magshell_fenicsx
+from magshell_fenicsx.parts.registered import ABILITIES, KINDS_OF_STEPS, REGISTERED
 
 PACKAGE = Path(magshell_fenicsx.__file__).parent
 NOT_IMPORTED = {  # room -> rooms that it does not know
@@ -67,8 +68,15 @@ def trees(room: str) -> Iterator[tuple[str, ast.AST]]:
         yield str(file.relative_to(PACKAGE)), ast.parse(file.read_text(encoding="utf-8"))
 
 
-def imported(tree: ast.AST, *, running: bool = False) -> Iterator[str]:
-    """The rooms that a file imports, also within functions and, but for `running`, for types alone."""
+def imported(tree: ast.AST, *, running: bool = False, below: str = "") -> Iterator[str]:
+    """The rooms that a file imports, also within functions and, but for `running`, for types alone.
+
+    Parameters
+    ----------
+    below
+        The room whose rooms are meant; those of the package without it.
+    """
+    package = f"{PACKAGE.name}.{below}".rstrip(".")
     typed = {
         inner
         for node in ast.walk(tree)
@@ -80,13 +88,13 @@ def imported(tree: ast.AST, *, running: bool = False) -> Iterator[str]:
         if node in typed:
             continue
         names = list[str]()
-        if isinstance(node, ast.ImportFrom) and node.module == PACKAGE.name:
+        if isinstance(node, ast.ImportFrom) and node.module == package:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             names = [node.module or ""]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        yield from (name.split(".")[1] for name in names if name.startswith(f"{PACKAGE.name}."))
+        yield from (name.removeprefix(f"{package}.").split(".")[0] for name in names if name.startswith(f"{package}."))
 
 
 @pytest.mark.parametrize("room", [*NOT_IMPORTED, *ALONE])
@@ -125,6 +133,19 @@ def test_no_room_asks_what_kind_a_model_is(room: str) -> None:
         if KNOWN_KINDS & {each.id for each in ast.walk(node.args[1]) if isinstance(each, ast.Name)}
     }
     assert asked == set()
+
+
+def test_parts_do_not_know_each_other() -> None:
+    """A part's room imports infrastructure, and infrastructure imports no part but through the registry."""
+    rooms = {file.stem for file in (PACKAGE / "parts").iterdir() if file.is_dir()} - {"__pycache__"}
+    rooms |= {path.split(".")[0] for path in (*REGISTERED, *KINDS_OF_STEPS.values(), *ABILITIES)}
+    arrows = set[tuple[str, str]]()
+    for name, tree in trees("parts"):
+        if name.removesuffix(".py").replace("/", ".") in REGISTRY:
+            continue
+        own = Path(name).parts[1].removesuffix(".py")
+        arrows |= {(name, other) for other in imported(tree, running=True, below="parts") if other in rooms - {own}}
+    assert arrows == set()
 
 
 @pytest.mark.parametrize("room", ["models", "shape", "assembly", "continuation", "mesh"])

@@ -1,10 +1,56 @@
-"""The pieces of a mesh that are not connected."""
+"""A mesh as a whole, whatever its ranks: its pieces that are not connected, and its cells on every rank."""
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True)
+class CellsOfAll:
+    """The cells of all ranks, on each of them.
+
+    Attributes
+    ----------
+    nodes
+        (cells, k) global numbers.
+    own
+        Those of this rank.
+    """
+
+    nodes: NDArray[np.intp]
+    own: range
+    comm: MPI.Comm
+
+    @classmethod
+    def of(cls, V: fem.FunctionSpace) -> "CellsOfAll":
+        """Of a space; collective."""
+        comm, index, count = V.mesh.comm, V.dofmap.index_map, V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+        local = V.dofmap.list[:count]
+        nodes = index.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        first = sum(comm.allgather(count)[: comm.rank])
+        return cls(np.concatenate(comm.allgather(nodes)).astype(np.intp), range(first, first + count), comm)
+
+    def gathered(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values of this rank's cells (those of ghosts after them are left out) -> of all; collective."""
+        return over_ranks(self.comm, values[: len(self.own)])
+
+
+def over_ranks(comm: MPI.Comm, values: NDArray[Any]) -> NDArray[Any]:
+    """The rows of all ranks, one rank's after the other's; collective."""
+    return np.concatenate(comm.allgather(values)) if comm.size > 1 else np.array(values)
+
+
+def whole(f: fem.Function) -> NDArray[np.float64]:
+    """The values (nodes, components) of all ranks, by global numbers; collective."""
+    V = f.function_space
+    size = V.dofmap.bs
+    return over_ranks(V.mesh.comm, f.x.array[: size * V.dofmap.index_map.size_local].reshape(-1, size))
 
 
 def pieces(V: fem.FunctionSpace) -> NDArray[np.int32]:

@@ -1,56 +1,42 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
-from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, lengths_with_units, texts
+from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, texts
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import GivenField
-from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.kinds import Bodies
-from magshell_fenicsx.parts.laminate import LaminateSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.motion.history import refuse_unfit_viscosity
-from magshell_fenicsx.parts.natural.section import NaturalSection, measured
+from magshell_fenicsx.parts.natural.section import NaturalSection
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts, parts_of
+from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
-from magshell_fenicsx.parts.touching.section import Pairs, refuse_unfit_pairs
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.parts.touching.section import Pairs
 from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.sections import (
-    CapSurface,
-    MeshSurface,
-    RevolutionSurface,
-    ShellSection,
-    Surface,
-    SurfaceSection,
-)
+from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface
+from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 
 if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
-
-
-REMANENCE = "magnetic.remanent.patches"
 
 
 def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
@@ -64,7 +50,7 @@ def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surfa
     Raises
     ------
     ValueError
-        If it has not, or the remanence of the rest is missing.
+        If it has not.
     """
     if isinstance(shell, MeshSurface):
         return
@@ -73,8 +59,6 @@ def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surfa
     known = [*(dimples or ["dimple"]), "rest"]
     if unknown := set(patches) - set(known):
         raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")
-    if key == REMANENCE and "rest" not in patches:
-        raise ValueError("magnetic.remanent: patches needs the patch rest")
 
 
 class Case(WithParts):
@@ -137,90 +121,21 @@ class Case(WithParts):
             for key, load in listed(section.loading).items():
                 if load.measured and isinstance(written[key], dict):
                     parts[key] = {name: value for name, value in written[key].items() if name != "hold"}
+            abilities = section.context.abilities
             for key in (
                 *texts(parts, is_formula),
-                *measured(data.get("natural")),
-                *_imperfections_with_units(section, data["shell"]),
-                *with_units(section.bodies, data.get("bodies")),
+                *(length for ability in abilities for length in ability.lengths(data)),
             ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
     @model_validator(mode="after")
-    def _sections_fit(self) -> Self:
-        known = self.magnetic is None or self.magnetic.lambda_m is not None or self.magnetic.without_field
-        if not known and self.shell.youngs_modulus is None:
-            raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
-        if self.magnetic and self.magnetic.applied.sources and not self.shell.with_units:
-            raise ValueError(
-                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
-            )
-        if self.sensors and self.magnetic is None:
-            raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
-        if self.magnetic and self.magnetic.interaction != "none" and "symmetry" in self.boundary.conditions().values():
-            raise ValueError(
-                "magnetic.interaction: needs the whole shell: with boundary: symmetry the case is a part of it alone"
-            )
-        if self.sensors and "symmetry" in self.boundary.conditions().values():
-            raise ValueError("sensors: need the whole shell: with boundary: symmetry the case is a part of it alone")
-        if self.magnetic and self.magnetic.without_field and not self.sensors and self.magnetic.interaction == "none":
-            raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
-        if self.magnetic and self.magnetic.energy != "full" and self.shell.law != "koiter":
-            raise ValueError(
-                f"magnetic.energy: {self.magnetic.energy}: the expansions are for a thickness that does not change; "
-                f"with shell.law: {self.shell.law} give full"
-            )
-        if self.sensors and self.shell.law != "koiter" and self.natural and self.natural.stretch is not None:
-            raise ValueError(
-                f"sensors: with shell.law: {self.shell.law} and natural.stretch: the field of a shell whose volume "
-                "grows is not built"
-            )
-        if self.shell.laminate:
-            self._refuse_unfit_laminate(self.shell.laminate)
-        layers = self.remanent.layers if self.remanent else None
-        if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
-            raise ValueError(
-                "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
-                "knows no more of them"
-            )
-        return self
-
-    def _refuse_unfit_laminate(self, laminate: LaminateSection) -> None:
-        laminate.refuse_unfit_units(self.shell)
-        if self.model == "solid":
-            raise ValueError("shell.laminate: is of a shell: take model: shell")
-        if laminate.twists and "symmetry" in self.boundary.conditions().values():
-            raise ValueError(
-                "boundary: symmetry: no plane mirrors a laminate that twists: for each ply lay one at -angle, at the "
-                "same distance from the middle, or model the whole shell"
-            )
-
-    @model_validator(mode="after")
-    def _imperfections_fit(self) -> Self:
-        shell = self.shell
-        if getattr(shell, "defect", None) and shell.imperfections:
-            raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
-        edge = None if shell.edge_polar is None else radians(shell.edge_polar)
-        for key, section in self.imperfections.items():
-            try:
-                section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
-            except ValueError as e:
-                raise ValueError(f"shell.{key}: {e}") from None
-        return self
-
-    @model_validator(mode="after")
-    def _named_parts_are_there(self) -> Self:
-        shell = self.shell
-        refuse_taken(self.points)
-        for key in parts_of(self.context):
-            self.context.has_modulus(key)
-        if isinstance(shell, ShellSection):
-            edges = EDGES[shell.geometry]
-            for name in self.boundary.conditions():
-                if name not in edges and name not in self.points:
-                    raise ValueError(f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}")
+    def _abilities_fit(self) -> Self:
+        for ability in self.context.abilities:
+            ability.refuse_unfit(self.context)
         for key, patches in self.patches.items():
-            refuse_strange(key, patches, shell, self.dimples)
+            refuse_strange(key, patches, self.shell, self.dimples)
+        refuse_unfit_steps(self.context)
         return self
 
     def problem(self) -> "Problem":
@@ -238,69 +153,24 @@ class Case(WithParts):
     @property
     def patches(self) -> dict[str, Iterable[str]]:
         """Keys with values by patch -> the names of these."""
-        found = {f"natural.{key}": getattr(self.natural, key, None) for key in ("curvature", "stretch")}
-        found["magnetic.remanent.patches"] = self.remanent and self.remanent.patches
-        found["magnetic.susceptibility"] = self.magnetic and self.magnetic.susceptibility
-        return {key: patches for key, patches in found.items() if isinstance(patches, dict)}
+        return {key: names for ability in self.context.abilities for key, names in ability.patches().items()}
 
     @model_validator(mode="after")
-    def _mesh_fits(self) -> Self:
-        shell = self.shell
-        if isinstance(shell, MeshSurface):
-            for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}):
-                raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
-        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None and not self.magnetic.without_field
-        if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
-            raise ValueError(
-                "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
-                "or lambda_m"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _what_a_solid_can(self) -> Self:
+    def _model_fits(self) -> Self:
+        read = isinstance(self.shell, MeshSurface)
+        for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}) if read else []:
+            raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
         if self.model == "shell":
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
         if isinstance(self.thickness_factor, dict | GivenField):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
-        if self.remanent and isinstance(self.remanent.components, GivenField):
-            raise ValueError("magnetic.remanent: of a solid a formula: a function on the mesh is that of a shell")
-        if self.sensors:
-            raise ValueError("sensors: read the field of a shell: take model: shell")
-        if self.natural and self.natural.given:
-            raise ValueError("natural: of a solid numbers and formulas: a function on the mesh is that of a shell")
-        if self.magnetic and self.magnetic.energy != "full":
-            raise ValueError(
-                f"magnetic.energy: {self.magnetic.energy}: the expansions are of a shell; a solid has the full energy"
-            )
-        if self.shell.law == "mooney-rivlin":
-            raise ValueError("shell.law: mooney-rivlin: is of a shell; a solid is neo-Hookean")
-        self.mesh.refuse_unfit_solid(read=isinstance(self.shell, MeshSurface))
+        self.mesh.refuse_unfit_solid(read=read)
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
         if self.solid:
             self.solid.refuse_unfit(self.shell.poisson_ratio)
-        return self
-
-    @model_validator(mode="after")
-    def _bodies_fit(self) -> Self:
-        for name, body in self.bodies.items():
-            self.context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
-        refuse_unfit_bodies(self.bodies, solid=self.model == "solid")
-        return self
-
-    @model_validator(mode="after")
-    def _contact_fits(self) -> Self:
-        refuse_unfit_pairs(self.contact, self.context, self.symmetry)
-        return self
-
-    @model_validator(mode="after")
-    def _programme_fits(self) -> Self:
-        density = self.time_unit is not None and self.shell.with_units
-        refuse_unfit_viscosity(self.shell, self.natural, density=density, solid=self.model == "solid")
-        refuse_unfit_steps(self.context)
         return self
 
     @cached_property
@@ -418,15 +288,3 @@ class Case(WithParts):
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
             raise InvalidCase(e.errors(), source, cls) from None
-
-
-def _imperfections_with_units(case: Case, shell: dict[str, Any]) -> Iterator[str]:
-    """The keys of imperfections that are lengths with a unit in plain data of a shell."""
-    written = {f"imperfections.{i}": item for i, item in enumerate(shell.get("imperfections") or [])}
-    sections: dict[str, object] = {f"imperfections.{i}": each for i, each in enumerate(case.shell.imperfections)}
-    if shell.get("defect"):
-        written["defect"], sections["defect"] = shell["defect"], case.imperfections["defect"]
-    for key, item in written.items():
-        section = sections[key]
-        assert isinstance(section, ImperfectionSection)
-        yield from lengths_with_units(type(section), item, f"shell.{key}.")

@@ -26,13 +26,11 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_fr
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
-from magshell_fenicsx.parts.laminate import laminate_leaves, laminate_of
+from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
-from magshell_fenicsx.parts.touching.section import leaves as whole
-from magshell_fenicsx.parts.touching.section import pairs
 from magshell_fenicsx.problem.account import account
 from magshell_fenicsx.problem.columns import refuse_twice
 from magshell_fenicsx.problem.formulas import (
@@ -137,7 +135,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
-    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies, pairs=pairs(case.contact, material))
+    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -212,11 +210,9 @@ def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leave
     context = case.context
     return [
         of_shape(case.shell, drawn),
-        *laminate_leaves(case.shell, drawn),
         *(leaves for section in context.abilities for leaves in section.leaves(context, drawn)),
         *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
         of_points(case.points.values(), case.shell.reference, drawn),
-        *whole(case.contact),
         *(term.leaves(drawn) for term in energies),
     ]
 

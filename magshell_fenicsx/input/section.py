@@ -152,15 +152,15 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured(BeforeValidator):
+class WithUnit(BeforeValidator):
     """The validator of a number that may have a unit."""
 
     unit: str = ""
 
 
-def or_number(unit: str, number: Any = float) -> Measured:
+def or_number(unit: str, number: Any = float) -> WithUnit:
     """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the schema."""
-    return Measured(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
+    return WithUnit(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
 
 
 def lengths_with_units(section: type[BaseModel], data: Mapping[str, Any], path: str = "") -> Iterator[str]:
@@ -178,7 +178,7 @@ def lengths_with_units(section: type[BaseModel], data: Mapping[str, Any], path: 
 
 def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
     """Whether a field with this annotation takes a length with a unit, or a list of these."""
-    if any(isinstance(each, Measured) and each.unit == "metre" for each in metadata):
+    if any(isinstance(each, WithUnit) and each.unit == "metre" for each in metadata):
         return True
     return any(is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
 
@@ -254,6 +254,11 @@ def _example(unit: str) -> str:
 
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
+Lengths = Annotated[
+    list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)
+]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 FluxDensity = Annotated[float, _quantity("tesla")]
 Density = Annotated[float, _quantity("kilogram/metre**3")]
 

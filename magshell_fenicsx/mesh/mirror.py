@@ -17,6 +17,7 @@ def rotation(azimuth: float) -> NDArray[np.float64]:
 
 Array = NDArray[np.float64]
 CUT = "symmetry"  # name of the edge on the plane
+STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
 ROUNDING = 1e-9
 
 

@@ -12,7 +12,7 @@ from magshell_fenicsx.parts.part import Context
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.path import StepOptions
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.parts.step import ProgrammeStep
+    from magshell_fenicsx.parts.step import Step
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
@@ -154,6 +154,34 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class ProgrammeStep:
+    """A step of a programme.
+
+    Attributes
+    ----------
+    number
+        From 1.
+    name
+        Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
+    key
+        Where it is in the case file.
+    """
+
+    number: int
+    name: str
+    key: str
+    load: "Step"
+
+    @property
+    def kind(self) -> str:
+        return str(getattr(self.load, "kind", ""))
+
+    @property
+    def until(self) -> Until:
+        return self.load.ends
+
+
+@dataclass(frozen=True)
 class Here:
     """Where a step begins, in the model's terms.
 
@@ -173,7 +201,7 @@ class Here:
         Whether a live pressure has no potential.
     """
 
-    step: "ProgrammeStep"
+    step: ProgrammeStep
     context: Context
     loads: "Loads"
     turn: float

@@ -4,7 +4,7 @@ A new kind is such a file, named after it, and its name here.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
@@ -14,6 +14,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSectio
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import Branches, Time
+from magshell_fenicsx.parts.rubber import LawKeys
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
@@ -54,13 +55,9 @@ Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 
 
-class ShellKeys(Section):
+class ShellKeys(LawKeys):
     """What parts add to the keys of every shell."""
 
-    law: Literal["koiter", "neo-hookean", "mooney-rivlin"] = "koiter"
-    """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6 (C10 + C01)"""
-    mooney: float | None = Field(default=None, ge=0, le=1000)
-    """C01/C10 of law: mooney-rivlin"""
     laminate: LaminateSection | None = None
     """Plies in place of one isotropic material, with law: koiter"""
     viscosity: Time | None = None
@@ -71,24 +68,12 @@ class ShellKeys(Section):
     """Deviations of the mid-surface along its normal, added up"""
 
     @model_validator(mode="after")
-    def _law_fits(self) -> Self:
-        if (self.mooney is not None) != (self.law == "mooney-rivlin"):
-            raise ValueError(
-                f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}"
-            )
-        if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
-            raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
+    def _laminate_fits(self) -> Self:
         if self.laminate and self.law != "koiter":
             raise ValueError(f"laminate: needs law: koiter: its strains are small; here the law is {self.law}")
         if self.laminate and (self.viscosity is not None or self.relaxation):
             raise ValueError("laminate: has no viscosity and no relaxation: these are of one isotropic material")
         return self
-
-    @property
-    def rubber(self) -> float | None:
-        """C01/(C10 + C01); None of Koiter's law."""
-        ratio = self.mooney or 0.0
-        return None if self.law == "koiter" else ratio / (1 + ratio)
 
     @classmethod
     def note_sizes(

@@ -4,6 +4,7 @@ Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 19
 plane stress and orthotropic, and the layer at the height z above the middle has the strain E - z K.
 """
 
+from dataclasses import dataclass
 from math import isnan
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.input.section import Section, Sized, given, or_number
+from magshell_fenicsx.input.section import Section, given, or_number
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.parts.part import Ability, Context
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -131,20 +133,6 @@ class LaminateSection(Section):
             return None
         return np.array([1.0, 0.0, 0.0] if self.along is None else self.along)
 
-    def refuse_unfit_units(self, shell: Sized) -> None:
-        """See that moduli and youngs_modulus are in one unit.
-
-        Raises
-        ------
-        ValueError
-            If one has a unit and the other has none.
-        """
-        if self.with_units == isnan(given(shell).E):
-            there = (
-                "have none: youngs_modulus has one" if not self.with_units else "have a unit: youngs_modulus has none"
-            )
-            raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
-
 
 def laminate_of(shell: Any, turn: float) -> "Laminate | None":
     """That of a shell in a frame turned about e3 (rad); None without plies."""
@@ -158,12 +146,40 @@ def laminate_of(shell: Any, turn: float) -> "Laminate | None":
     return Laminate(section.matrices(shell.youngs_modulus or 1.0), turned, section.isotropic)
 
 
-def laminate_leaves(shell: Any, outline: "Outline") -> list[Leaves]:
-    """The symmetry that the plies leave: all of isotropic ones, else that of the directions if nothing twists."""
-    section: LaminateSection | None = shell.laminate
-    if section is None or section.isotropic:
-        return []
-    vector = section.direction(shell.geometry)
+@dataclass(frozen=True)
+class Laminated(Ability):
+    """The laminate of a shell."""
+
+    section: LaminateSection
+
+    @classmethod
+    def of(cls, context: Context) -> "Laminated | None":
+        return cls(context.shell.laminate) if context.shell.laminate else None
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that moduli and youngs_modulus are in one unit, and that a mirror plane mirrors the plies."""
+        section = self.section
+        if section.with_units == isnan(given(context.shell).E):
+            there = (
+                "have a unit: youngs_modulus has none" if section.with_units else "have none: youngs_modulus has one"
+            )
+            raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
+        context.needs("shell.laminate", "a mid-surface")
+        if section.twists:
+            context.needs(
+                "shell.laminate",
+                "the whole shell",
+                hint="no plane of boundary: symmetry mirrors a laminate that twists: for each ply lay one at -angle, "
+                "at the same distance from the middle",
+            )
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """All symmetry of isotropic plies, else that of the directions if nothing twists."""
+        return [] if self.section.isotropic else [_leaves(self.section, context.shell.geometry)]
+
+
+def _leaves(section: LaminateSection, geometry: str) -> Leaves:
+    vector = section.direction(geometry)
     unit = None if vector is None else vector / np.linalg.norm(vector)
     reason = None
     if section.twists:
@@ -180,7 +196,7 @@ def laminate_leaves(shell: Any, outline: "Outline") -> list[Leaves]:
         return min(across, abs(across - 1)) <= NONE
 
     beside = () if unit is None else tuple(float(np.arctan2(unit[1], unit[0])) + turn for turn in (0.0, np.pi / 2))
-    return [Leaves(reason, mirrors=mirrors, azimuths=() if section.twists else beside)]
+    return Leaves(reason, mirrors=mirrors, azimuths=() if section.twists else beside)
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:

@@ -2,16 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
-from magshell_fenicsx.parts.bodies.contact import Contact
-from magshell_fenicsx.parts.magnetism.interaction import Interaction
-from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
-from magshell_fenicsx.parts.magnetism.sensors import Sensor
-from magshell_fenicsx.parts.natural.shape import Natural
-from magshell_fenicsx.parts.touching.touching import Pair
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.bodies.contact import Contact
+    from magshell_fenicsx.parts.magnetism.interaction import Interaction
+    from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+    from magshell_fenicsx.parts.magnetism.sensors import Sensor
+    from magshell_fenicsx.parts.natural.shape import Natural
+    from magshell_fenicsx.parts.touching.touching import Pair
 
 
 @dataclass(frozen=True)
@@ -36,17 +39,17 @@ class Loads:
 
     pressure: bool = False
     forces: Mapping[str, Force] = field(default_factory=dict)
-    magnetic: Magnetisation | None = None
+    magnetic: "Magnetisation | None" = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
     own: tuple[OwnTerm, ...] = ()
-    natural: Natural | None = None
+    natural: "Natural | None" = None
     moves: tuple[Move, ...] = ()
-    contacts: tuple[Contact, ...] = ()
+    contacts: "tuple[Contact, ...]" = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
-    remanence: Magnetisation | None = None
-    sensors: tuple[Sensor, ...] = ()
-    interaction: Interaction | None = None
-    pairs: tuple[Pair, ...] = ()
+    remanence: "Magnetisation | None" = None
+    sensors: "tuple[Sensor, ...]" = ()
+    interaction: "Interaction | None" = None
+    pairs: "tuple[Pair, ...]" = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -1,8 +1,8 @@
 """The base of parts: sections of a case that add energies."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +72,34 @@ class Context:
 
     @property
     def abilities(self) -> "list[Ability]":
-        """The sections that add something to the problem."""
-        return [section for section in self.sections.values() if isinstance(section, Ability)]
+        """All that adds something to the problem."""
+        from magshell_fenicsx.parts.registered import abilities_of  # knows all parts
+
+        return abilities_of(self)
+
+    def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
+        """See that the case has what a key needs.
+
+        Parameters
+        ----------
+        hint
+            What to do; without one, what gives back the offer.
+
+        Raises
+        ------
+        ValueError
+            With the first of the offers that is not there.
+        """
+        withdrawn = dict[Offer, str]()
+        for ability in self.abilities:
+            withdrawn |= ability.withdraws(self)
+        if self.solid:
+            withdrawn["a mid-surface"] = "a solid has none: take model: shell"
+        if self.shell.thickness_factor is not None:
+            withdrawn["the same thickness everywhere"] = "leave out shell.thickness_factor"
+        for offer in offers:
+            if offer in withdrawn:
+                raise ValueError(f"{key}: needs {offer}; {hint or withdrawn[offer]}")
 
     def loads(self, kind: "type[AnyStep]") -> "dict[str, AnyStep]":
         """Amplitude -> its last step, of the steps of a kind."""
@@ -205,8 +231,67 @@ class Account:
     left_out: list[str] = field(default_factory=list)
 
 
-class Ability(Section):
-    """A section of the case file that adds something to a problem; by default nothing."""
+Offer = Literal[
+    "a mid-surface",
+    "the whole shell",
+    "the same thickness everywhere",
+    "a thickness that does not change",
+    "the area as drawn",
+]
+
+
+@dataclass(frozen=True)
+class InTime:
+    """A load that may be a function of time, though no step drives it: its name in `history`.
+
+    Attributes
+    ----------
+    with_units
+        Whether its values may have a unit.
+    refused
+        Why it may not be one here; empty if it may.
+    """
+
+    name: str
+    with_units: bool
+    refused: str
+
+
+class Ability:
+    """What adds something to a problem, mostly a section of the case file; by default it adds nothing.
+
+    One that is no section finds itself in a case (`of`). All stand in `ABILITIES` of `registered.py`.
+    """
+
+    @classmethod
+    def of(cls, context: Context) -> Self | None:
+        """That of a case; None without."""
+        return context.of(cls)
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that it goes with all else in the case.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
+
+    def withdraws(self, context: Context) -> "dict[Offer, str]":
+        """What abilities may need and a case with this one has not -> what takes it away, and what to do."""
+        return {}
+
+    def lengths(self, data: Mapping[str, Any]) -> Iterable[str]:
+        """The keys of its plain data, in that of the case, that are text with a unit of length."""
+        return []
+
+    def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
+        """Its load that may be a function of time, after steps that have driven amplitudes; None without."""
+        return None
+
+    def patches(self) -> dict[str, Iterable[str]]:
+        """Its keys with values by patch -> the names of these."""
+        return {}
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""
@@ -242,7 +327,26 @@ class Ability(Section):
         return units
 
 
-class Part(Ability):
+@dataclass(frozen=True)
+class KeyAbility(Ability, Generic[Kind]):
+    """One whose key has a list or a mapping, of which none is empty.
+
+    Attributes
+    ----------
+    given
+        What stands at the key.
+    """
+
+    key: ClassVar[str]
+    given: Kind
+
+    @classmethod
+    def of(cls, context: Context) -> Self | None:
+        given = context.sections.get(cls.key)
+        return cls(given) if given else None
+
+
+class Part(Section, Ability):
     """A section of the case file whose energies are integrals over the mid-surface.
 
     A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys appear in
@@ -263,6 +367,9 @@ class Part(Ability):
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         register(cls.quantities)
+
+    def refuse_unfit(self, context: Context) -> None:
+        context.has_modulus(next(key for key, section in context.sections.items() if section is self))
 
     def terms(self, scales: Scales) -> Sequence[OwnTerm]:
         """The energies, with the values of their amplitudes."""

@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, create_model
 
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.part import Account, Context, Part
+from magshell_fenicsx.parts.part import Ability, Account, Context, Part
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import Step
 
@@ -39,12 +39,25 @@ KINDS_OF_STEPS: dict[str, str] = {
 }
 FIRST = ("natural", "interaction", "field")  # the kinds of steps that may come before the one load, in their order
 
+ABILITIES = (  # module here and class in it, of those without a key and a line in REGISTERED
+    "supports.boundary.BoundarySection",
+    "magnetism.fields.MagneticSection",
+    "magnetism.sensors.Sensing",
+    "natural.section.NaturalSection",
+    "imperfections.imperfection.Imperfect",
+    "laminate.Laminated",
+    "rubber.Rubber",
+    "motion.history.Viscosity",
+    "bodies.body.RigidBodies",
+    "touching.section.ShellContact",
+)
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
     "imperfections.growth.GrowingSeen",
     "pressure.pressure.PressureSeen",
     "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
+    "magnetism.direction.FieldSeen",
     "magnetism.source_step.SourcesSeen",
     "magnetism.readings.SoftSeen",
     "magnetism.interaction.InteractionSeen",
@@ -134,6 +147,12 @@ def parts_of(context: Context) -> dict[str, Part]:
     return {key: part for key in PARTS if (part := context.sections.get(key)) is not None}
 
 
+def abilities_of(context: Context) -> list[Ability]:
+    """All that add something to a problem."""
+    listed = (ability.of(context) for ability in KNOWN)
+    return [*parts_of(context).values(), *(ability for ability in listed if ability is not None)]
+
+
 def accounts(context: Context, loads: "Loads") -> list[Account]:
     """What all rooms have in a model."""
     return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
@@ -149,6 +168,7 @@ PARTS: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
 STEPS: dict[str, type[Step]] = {kind: _named(path) for kind, path in KINDS_OF_STEPS.items()}
+KNOWN: tuple[type[Ability], ...] = tuple(map(_named, ABILITIES))
 SEEN: tuple[Seen, ...] = tuple(_named(path)() for path in WHAT_IS_SEEN)
 
 

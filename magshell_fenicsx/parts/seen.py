@@ -36,6 +36,8 @@ class Sight:
         Plane of the half that is modelled, None for all; and azimuth of the model's frame (rad).
     reactions
         Whether those of all supports are reported.
+    sense
+        Sign of the case's field.
     """
 
     model: "Observed"
@@ -44,6 +46,7 @@ class Sight:
     mirror: Mirror | None
     azimuth: float
     reactions: bool
+    sense: float = 1.0
 
     @property
     def loads(self) -> "Loads":
@@ -148,6 +151,10 @@ class Seen:
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         """A column with its derivatives; None if it is another room's; collective."""
         return None
+
+    def left_out(self, sight: Sight) -> Sequence[str]:
+        """What the model lacks of it, for people."""
+        return ()
 
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
         """What summary.json says of the end of a path; collective."""

@@ -1,7 +1,6 @@
 """The base of the steps of a programme: what a step drives, how, and how far."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -27,6 +26,9 @@ from magshell_fenicsx.parts.course import (
     SnapSection,
     Target,
     Until,
+)
+from magshell_fenicsx.parts.course import (
+    ProgrammeStep as ProgrammeStep,
 )
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -154,7 +156,7 @@ class Step(Section):
         """See `Course`, from any state of the step."""
         return None
 
-    def ahead(self, step: "ProgrammeStep", context: Context, loads: "Loads", turn: float) -> Ahead | None:
+    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead | None:
         """Its end, if its target does not say it."""
         return None
 
@@ -189,7 +191,7 @@ class Step(Section):
         """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number from the second on."""
         return None
 
-    def refuse_unfit(self, step: "ProgrammeStep", context: Context) -> None:
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         """See that the case has what the step needs.
 
         Raises
@@ -198,23 +200,23 @@ class Step(Section):
             With the key and what is allowed.
         """
 
-    def terms(self, step: "ProgrammeStep", context: Context) -> list[OwnTerm]:
+    def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
         """Energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
         return []
 
-    def multiplies(self, step: "ProgrammeStep", context: Context) -> list[str]:
+    def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
         """Keys below `shell` of the imperfections that it multiplies."""
         return []
 
-    def account(self, step: "ProgrammeStep", context: Context) -> str:
+    def account(self, step: ProgrammeStep, context: Context) -> str:
         """The line of `magshell check`, if nothing else says it."""
         return ""
 
-    def leaves(self, step: "ProgrammeStep", context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""
         return []
 
-    def place_on(self, step: "ProgrammeStep", context: Context, outline: "Outline") -> Array | None:
+    def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array | None:
         """The one place (3,) over R where it is, in the frame of the case; None if it is not at one.
 
         Raises
@@ -229,7 +231,7 @@ class Step(Section):
         chart = outline.inverse(rotation(turn) @ place)
         return outline.on_half(chart) if half else chart
 
-    def refuse_unfit_place(self, step: "ProgrammeStep", context: Context, outline: "Outline", at: Array) -> None:
+    def refuse_unfit_place(self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array) -> None:
         """See that there is room for it around its place in the chart.
 
         Raises
@@ -268,37 +270,9 @@ class Step(Section):
         """The same, where another step holds the amplitude of this kind or drives it in time."""
         return {}
 
-    def adds(self, step: "ProgrammeStep", context: Context, modelled: Modelled) -> dict[str, Any]:
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         """Fields of the model's `Loads`, to which those of other parts are added."""
         return {}
-
-
-@dataclass(frozen=True)
-class ProgrammeStep:
-    """A step of a programme.
-
-    Attributes
-    ----------
-    number
-        From 1.
-    name
-        Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
-    key
-        Where it is in the case file.
-    """
-
-    number: int
-    name: str
-    key: str
-    load: Step
-
-    @property
-    def kind(self) -> str:
-        return str(getattr(self.load, "kind", ""))
-
-    @property
-    def until(self) -> Until:
-        return self.load.ends
 
 
 class PathStep(Step):

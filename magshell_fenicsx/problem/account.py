@@ -9,6 +9,7 @@ from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
+from magshell_fenicsx.parts.rubber import law_account
 from magshell_fenicsx.problem.problem import Body, body_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
@@ -75,13 +76,8 @@ def _imperfections(context: Context, rims: int) -> str:
 
 
 def _of_shell(context: Context) -> str:
-    rubber, laminate = context.shell.rubber, context.shell.laminate
-    if laminate:
-        return laminate_account(laminate, context.shell)
-    if rubber is None:
-        return "membrane and bending energy"
-    law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"
-    return f"membrane and bending energy of incompressible rubber at any stretch ({law}); its thickness follows"
+    laminate = context.shell.laminate
+    return laminate_account(laminate, context.shell) if laminate else law_account(context.shell.rubber)
 
 
 def _elastic(body: Body) -> str:

@@ -31,7 +31,7 @@ from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import hardened, rigid, touching
+from magshell_fenicsx.simulate.touch import hardened, pressing, rigid
 
 Say = Callable[[str], None]
 ROUNDING = 1e-9  # a coordinate over R as small as this is zero
@@ -138,7 +138,7 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     It is compared with the nearest one of the same label: a mode that is not there any more changes too. nan, if the
     shell finds no such equilibrium near.
     """
-    bodies = touching(scene, state)
+    bodies = pressing(scene, state)
     if not bodies:
         return [0.0] * len(modes)
     harder = hardened(scene, state, bodies)

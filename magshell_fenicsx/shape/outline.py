@@ -12,22 +12,12 @@ from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
-from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
+from magshell_fenicsx.mesh.revolved import Capped, Profile, Revolved
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape, flat, sphere, upwards
 from magshell_fenicsx.shape.ground import Ground
 from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
-from magshell_fenicsx.shape.sections import (
-    AnnulusSurface,
-    CapSurface,
-    CylinderSurface,
-    MeshSurface,
-    PlateSurface,
-    RevolutionSurface,
-    RoundSection,
-    ShellSection,
-    Surface,
-    TorusSurface,
-)
+from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface, RoundSection
+from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface, ShellSection, Surface
 from magshell_fenicsx.shape.turning import Span
 
 Array = NDArray[np.float64]
@@ -210,7 +200,7 @@ def outline(shell: Surface | ShellSection) -> Outline:
         high = np.array([1.0, shell.width / shell.reference])
         grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
         return _grid(grid, flat, upwards, lambda x: np.clip(x[:2], 0.0, high), high)
-    profile, names = _profile(shell)
+    profile, names = shell.turned
     if names[1] is None:
         capped, bent = Capped(profile), _curvature(profile)
         drawn = _disc(profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent)
@@ -243,12 +233,11 @@ def _disc(
     return Outline(chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span)
 
 
-def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
-    assert isinstance(shell, RoundSection | RevolutionSurface)
+def _ring(shell: RoundSection | RevolutionSurface, profile: Profile, names: tuple[str, str]) -> Outline:
     first, last = shell.turn
     along = np.linspace(0, profile.length, 101, dtype=np.float64)
     rho = float(profile(along)[:, 0].max())
-    glued = shell.azimuth is None, isinstance(shell, TorusSurface) and shell.tube is None
+    glued = shell.azimuth is None, shell.closed
     low, high = (first * rho, 0.0), (last * rho, profile.length)
     embedding = Revolved(profile, rho)
 
@@ -300,26 +289,6 @@ def _grid(
 
 def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:
     return [half for plane in planes for half in (plane, plane.reversed)]
-
-
-def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:
-    """The curve that is turned about e3, over R, and the names of its ends; no second one for the pole."""
-    if isinstance(shell, CapSurface):
-        assert shell.hole is not None
-        return Arc(1.0, pi / 2 - radians(shell.polar), pi / 2 - radians(shell.hole)), ("rim", "hole")
-    if isinstance(shell, CylinderSurface):
-        return Segment((1.0, 0.0), (1.0, shell.length / shell.radius)), ("bottom", "top")
-    if isinstance(shell, AnnulusSurface):
-        return Segment((1.0, 0.0), (shell.inner_radius / shell.radius, 0.0)), ("outer", "inner")
-    if isinstance(shell, TorusSurface):
-        first, last = shell.tube or (0.0, 360.0)
-        return Arc(shell.tube_radius / shell.radius, radians(first), radians(last), 1.0), ("bottom", "top")
-    assert isinstance(shell, RevolutionSurface)
-    curve = shell.profile.curve / shell.reference
-    straight = len(curve) == 2
-    ends = tuple(map(float, curve[0])), tuple(map(float, curve[1]))
-    profile: Profile = Segment(*ends) if straight else Spline(curve)  # type: ignore[arg-type]
-    return profile, ("bottom", None if curve[-1, 0] == 0 else "top")
 
 
 def _plane(x: Array) -> Array:

@@ -1,182 +1,28 @@
-"""Any mid-surface: the shells of the paper, caps, cylinders, plates, rings, tori, profiles, and a user's mesh.
+"""Any mid-surface: the shells of the paper, surfaces of revolution, plates, and a user's mesh."""
 
-Lengths are plain numbers of one unit that the user chooses, or all have units and are then in metres;
-the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
-"""
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from math import radians
-from typing import Annotated, Any, Literal, Self
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
-import numpy as np
-from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
-
-from magshell_fenicsx.input.expressions import Formula, formula
+from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import (
     Density,
     FileKeys,
     Length,
-    OrOfProgram,
     Pressure,
     Section,
     in_units,
-    or_number,
-    texts,
 )
-from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
-
-Positive = Annotated[float, Field(gt=0)]
-Measure = Annotated[float, or_number("metre", Positive), Field(gt=0)]
-Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
-Heights = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=2, max_length=2)]
-Azimuth = Annotated[Range | None, Field(description="First and last, of a part; closed without [degree]")]
-FULL_TURN = [0.0, 360.0]
-MEASURES = ("thickness", "youngs_modulus", "density", "radius", "length", "width", "inner_radius", "tube_radius")
-
-
-class Material(Section):
-    """Thickness and material of every mid-surface."""
-
-    thickness: Measure
-    """Thickness h; R/h is 3 to 1e6 [length]"""
-    youngs_modulus: Modulus | None = None
-    """Young's modulus E; dead loads and flux densities need it [force/length²]"""
-    poisson_ratio: float = Field(gt=-1, le=0.5)
-    """Poisson's ratio ν"""
-    density: Annotated[float, or_number("kilogram/metre**3", Positive), Field(gt=0)] | None = None
-    """Density ρ; with it frequencies are in hertz [mass/length³]"""
-    thickness_factor: Annotated[
-        Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | GivenField | None, OrOfProgram(GivenField)
-    ] = None
-    """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
-
-
-class SurfaceSection(ShellKeys, Material):
-    """What all have in common."""
-
-    _with_units: bool = PrivateAttr(default=False)
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
-        written = {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
-        measured = {key: value for key, value in written.items() if isinstance(value, str | int | float)}
-        kinds = {isinstance(value, str) for value in measured.values()}
-        profile = data.get("profile") if isinstance(data, dict) else None
-        if len(kinds) > 1 or (kinds == {False} and [*texts(profile)]):
-            bare = [key for key, value in measured.items() if not isinstance(value, str)] or ["a length of profile"]
-            raise ValueError(
-                f"give every length and youngs_modulus a unit, or none of them: {', '.join(bare)} has none"
-            )
-        cls.note_sizes(data, handler, info, with_units=kinds == {True})
-        section = handler(data)
-        modulus = section.youngs_modulus
-        if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:
-            raise ValueError(
-                f"shell.youngs_modulus: {written['youngs_modulus']!r}: allowed are 1 Pa to 1e13 Pa (MPa: megapascal, "
-                "mPa: millipascal)"
-            )
-        if isinstance(data, dict):
-            section._with_units = kinds == {True}
-        return section
-
-    @model_validator(mode="after")
-    def _thin(self) -> Self:
-        if not 3 <= self.R_over_h <= 1e6:
-            raise ValueError(f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6")
-        if self.density is not None and self.youngs_modulus is None:
-            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus")
-        if isinstance(self.thickness_factor, GivenField) and self.thickness_factor.size != 1:
-            raise ValueError(f"thickness_factor: a function of {self.thickness_factor.size} numbers; it has one")
-        if isinstance(self.thickness_factor, dict) and not isinstance(self, MeshSurface):
-            raise ValueError("thickness_factor: patches have names only with geometry: mesh")
-        return self
-
-    @property
-    def edge_polar(self) -> float | None:
-        """Of a part of a sphere the angle of its edge from e3 (degrees); None of other geometries."""
-        return None
-
-    @property
-    def with_units(self) -> bool:
-        """Whether lengths and Young's modulus were given units, and are in SI."""
-        return self._with_units
-
-    @property
-    def reference(self) -> float:
-        """The length R that results and formulas are over."""
-        raise NotImplementedError
-
-    @property
-    def R_over_h(self) -> float:
-        return self.reference / self.thickness
-
-    @property
-    def modulus(self) -> float | None:
-        """E that dead loads are over."""
-        return self.youngs_modulus
-
-
-def _refuse_overturned(azimuth: list[float] | None) -> None:
-    first, last = azimuth or FULL_TURN
-    if not 1e-3 <= last - first <= 360:
-        raise ValueError(f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360")
-
-
-class RoundSection(SurfaceSection):
-    """Has a radius; `azimuth` (degrees) is the part that there is, closed where it is not given."""
-
-    radius: Measure
-    """Reference length R, which formulas and dimensionless results are over [length]"""
-    azimuth: Azimuth = None
-
-    @model_validator(mode="after")
-    def _turns_once(self) -> Self:
-        _refuse_overturned(self.azimuth)
-        return self
-
-    @property
-    def reference(self) -> float:
-        return self.radius
-
-    @property
-    def turn(self) -> tuple[float, float]:
-        """First and last azimuth (rad)."""
-        first, last = self.azimuth or FULL_TURN
-        return radians(first), radians(last)
-
-
-class CapSurface(RoundSection):
-    """Sphere from `polar` (degrees from e3) up to the pole or a `hole`; edges rim, hole and, of a part, left, right."""
-
-    geometry: Literal["cap"]
-    polar: float = Field(default=90.0, ge=1, le=179)
-    """Angle of the rim from e3 [degree]"""
-    hole: float | None = Field(default=None, ge=0.1)
-    """Angle of the hole's edge from e3 [degree]"""
-    defect: Dimple | None = None
-    """One dimple; for more see imperfections"""
-
-    @model_validator(mode="after")
-    def _hole_within(self) -> Self:
-        if self.hole is not None and self.hole >= self.polar - 0.1:
-            raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
-        if self.hole is None and self.azimuth is not None:
-            raise ValueError("azimuth: a part of a cap needs a hole around the pole")
-        return self
-
-    @property
-    def edge_polar(self) -> float | None:
-        return self.polar
-
-
-class CylinderSurface(RoundSection):
-    """Around e3 from z = 0 to `length`, or a panel of it; edges bottom, top and, of a panel, left, right."""
-
-    geometry: Literal["cylinder"]
-    length: Measure
-    """Along e3 [length]"""
+from magshell_fenicsx.shape.revolved import (
+    AnnulusSurface,
+    CapSurface,
+    CylinderSurface,
+    Measure,
+    RevolutionSurface,
+    SurfaceSection,
+    TorusSurface,
+)
 
 
 class PlateSurface(SurfaceSection):
@@ -193,113 +39,13 @@ class PlateSurface(SurfaceSection):
         return self.length
 
 
-class AnnulusSurface(RoundSection):
-    """Flat ring; with azimuth: [0, 360] it is slit. Edges inner, outer and, where it is not closed, left, right."""
-
-    geometry: Literal["annulus"]
-    inner_radius: Measure
-    """Smaller than the radius [length]"""
-
-    @model_validator(mode="after")
-    def _inner_within(self) -> Self:
-        if self.inner_radius >= self.radius:
-            raise ValueError(f"inner_radius: {self.inner_radius:g}: must be smaller than radius, {self.radius:g}")
-        return self
-
-
-class TorusSurface(RoundSection):
-    """A tube around the circle of `radius`; `tube` (degrees, from outside towards e3) is the part of its section.
-
-    Edges left, right and, with tube, bottom, top.
-    """
-
-    geometry: Literal["torus"]
-    tube_radius: Measure
-    """Of the tube's section [length]"""
-    tube: Range | None = None
-    """First and last angle of the tube's section; all of it without [degree]"""
-
-    @model_validator(mode="after")
-    def _hole_in_it(self) -> Self:
-        first, last = self.tube or FULL_TURN
-        if not 1e-3 <= last - first <= 360:
-            raise ValueError(f"tube: from {first:g} to {last:g} degrees; it must grow, by at most 360")
-        inside = self.radius + self.tube_radius * np.cos(np.radians(np.linspace(first, last, 721))).min()
-        if inside <= 0:
-            raise ValueError(f"tube_radius: {self.tube_radius:g}: the tube reaches the axis; radius is {self.radius:g}")
-        return self
-
-
-class ProfileSection(Section):
-    """A smooth curve (r, z) through points, or r as a formula of z (in the case's lengths)."""
-
-    points: list[Heights] | None = Field(default=None, min_length=2)
-    """(r, z) that a spline goes through; two make a straight line [the shell's length]"""
-    radius: Formula | None = None
-    """r as a formula of z [the shell's length]"""
-    heights: Heights | None = None
-    """First and last z of the formula [the shell's length]"""
-
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
-        if (self.points is None) == (self.radius is None) or (self.radius is None) != (self.heights is None):
-            raise ValueError("give points, or radius (a formula of z) and heights")
-        r = self.curve[:, 0]
-        if not np.isfinite(self.curve).all() or r.max() <= 0 or (r[:-1] <= 0).any() or r[-1] < 0:
-            raise ValueError("r must be positive along the profile; only its end may lie on the axis, as a pole")
-        if (np.linalg.norm(np.diff(self.curve, axis=0), axis=1) == 0).any():
-            raise ValueError("two points that follow each other are the same")
-        return self
-
-    @property
-    def curve(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Points (n, 2) that the curve goes through."""
-        if self.points is not None:
-            return np.array(self.points)
-        assert self.radius is not None
-        assert self.heights is not None
-        z = np.linspace(self.heights[0], self.heights[1], 201, dtype=np.float64)
-        r = formula(self.radius)(0 * z, 0 * z, z)
-        return np.column_stack([np.where(np.abs(r) < 1e-12 * np.abs(r).max(), 0.0, r), z])
-
-
-class RevolutionSurface(SurfaceSection):
-    """A profile turned about e3; the normal points to the right of its direction (outside, if it goes up).
-
-    Edges bottom (its beginning), top (its end, if that is not the pole), left, right.
-    """
-
-    geometry: Literal["revolution"]
-    profile: ProfileSection
-    """The curve; its largest r is the reference length R"""
-    azimuth: Azimuth = None
-    defect: Dimple | None = None
-    """One dimple; for more see imperfections"""
-
-    @property
-    def reference(self) -> float:
-        return float(self.profile.curve[:, 0].max())
-
-    @property
-    def turn(self) -> tuple[float, float]:
-        """First and last azimuth (rad)."""
-        first, last = self.azimuth or FULL_TURN
-        return radians(first), radians(last)
-
-    @model_validator(mode="after")
-    def _turns(self) -> Self:
-        _refuse_overturned(self.azimuth)
-        if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
-            raise ValueError("azimuth: a part of a surface with a pole cannot be built")
-        return self
-
-
 class MeshSurface(FileKeys, SurfaceSection):
     """A .msh file: physical groups of surfaces are patches, those of curves are edges.
 
     What a mesh must be, and how to make one: meshes/README.md.
     """
 
+    has_patches: ClassVar[bool] = True
     geometry: Literal["mesh"]
     file: str
     """Its path from the folder of the case; triangles of order 1 to 3"""

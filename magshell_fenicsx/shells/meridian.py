@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Lid, Pressed
 from magshell_fenicsx.assembly.parameters import Growing, Parameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
@@ -28,8 +28,9 @@ from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_f
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
+from magshell_fenicsx.parts.pressure.openings import meridian_openings
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
-from magshell_fenicsx.parts.supports.on_meridian import openings, supports
+from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
@@ -161,7 +162,7 @@ class MeridianModel(Thin):
             self.energies.append(factory.mirror_edges(self.held.mirror, np.array([0.0, 0.0, 1.0])))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
-        free_ends, self.without_potential = openings(meridian, conditions)
+        free_ends, self.without_potential = meridian_openings(meridian, conditions)
         closed = enclosed(loads, free_ends, self.without_potential)
         swept = loads.pressure or closed
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
@@ -217,6 +218,9 @@ class MeridianModel(Thin):
     def chart(self) -> Array:
         """Coordinates (n, 1) of the nodes along the meridian."""
         return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
+
+    def refuse_loose(self, amplitudes: Amplitudes) -> None:
+        self.held.refuse_loose(self.r0)
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""

@@ -1,7 +1,8 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -25,6 +26,7 @@ from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
+from magshell_fenicsx.parts.supports.supports import refuse_loose
 from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.shells.terms import EnergyFactory
 
@@ -90,6 +92,11 @@ class Observed:
     thickness: fem.Function | None = None
     midsurface: Midsurface | None = None
 
+    @cached_property
+    def kept(self) -> dict[type, Any]:
+        """What rooms of parts keep with the model, by its class."""
+        return {}
+
     @property
     def mirrored_facets(self) -> Facets:
         """The edges on the mirror plane of a half model; none of another."""
@@ -106,6 +113,16 @@ class Observed:
         """The term of the dead loads of an amplitude, except the moments."""
         self.load_size[name] = dead.size
         return LinearTerm(name, *dead.entries, self.u, name)
+
+    def refuse_loose(self, amplitudes: Amplitudes) -> None:
+        """See that no rigid motion is left free; collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, with the motion.
+        """
+        refuse_loose(self.system, self.r0, amplitudes)
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -133,7 +150,7 @@ class Observed:
         rows[np.arange(3), dofs] = 1.0
         return rows
 
-    def touching(self, state: State, approach: str) -> Region:
+    def region(self, state: State, approach: str) -> Region:
         """Where a body touches."""
         pressing, forms = self.contacts[approach]
         at = self.system.at(state)

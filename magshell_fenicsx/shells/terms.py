@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.bodies.contact import (
     pressed_radius,
     thinned_energy,
 )
-from magshell_fenicsx.parts.bodies.thinning import thinning
+from magshell_fenicsx.parts.gap import thinning
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation

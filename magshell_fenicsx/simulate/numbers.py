@@ -30,19 +30,8 @@ OF_MATERIAL = (
     "thickness_factor",
 )
 OF_DEVIATION = ("imperfections", "defect")
-ELSEWHERE = (
-    "mesh",
-    "loading",
-    "points",
-    "boundary",
-    "stability",
-    "frequencies",
-    "gradients",
-    "ensemble",
-    "design",
-    "identify",
-    "output",
-)
+BESIDE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "identify", "output")
+ELSEWHERE = (*BESIDE, "loading", "points", "boundary")
 
 
 def number_of(context: Context, key: str) -> float:

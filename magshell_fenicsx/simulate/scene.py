@@ -25,14 +25,11 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0, rotation
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
-from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.pressure.openings import no_potential
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
-from magshell_fenicsx.parts.supports.supports import refuse_loose
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
@@ -80,7 +77,7 @@ def build_meridian_model(problem: Problem) -> MeridianModel:
         problem.mesh.penalty,
         problem.thickness,
     )
-    model.held.refuse_loose(model.r0)
+    model.refuse_loose({})
     return model
 
 
@@ -142,7 +139,7 @@ class Scene:
         surface = self.model.midsurface
         several = surface is not None and surface.read  # a file may have pieces, of which each must be held
         if not self.model.axisymmetric and (several or not self.problem.fixed):
-            refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
+            self.model.refuse_loose(self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
         options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts or self.model.touchings else None
@@ -192,8 +189,7 @@ class Scene:
     @property
     def left_out(self) -> list[str]:
         """What the model lacks, for people."""
-        open_at = self.model.without_potential if self.problem.loads.pressure else ()
-        return [*self.problem.left_out, *([no_potential(open_at)] if open_at else [])]
+        return [*self.problem.left_out, *(said for room in SEEN for said in room.left_out(self.sight))]
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
@@ -250,7 +246,7 @@ class Scene:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         self.refuse_foreign(state, more=True)
         model, h, loads, sight = self.model, self.problem.material.h, self.model.loads, self.sight
-        force, sense = loads.forces.get("force"), copysign(1.0, self.problem.lambda_m)
+        force = loads.forces.get("force")
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
         columns = defaultdict[str, float](float)
@@ -259,8 +255,6 @@ class Scene:
         split = "stretching" in columns  # a solid has no such split
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
-            "lambda_m": field_size(state.mu, sense),
-            "field_angle": field_angle(state.mu, loads.magnetic, sense),
             "force": 0.0,
             "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h if loads.displaced else pole,
             "w_pole_over_h": pole,
@@ -326,7 +320,9 @@ class Scene:
     def sight(self) -> Sight:
         """What rooms of parts see of it."""
         problem = self.problem
-        return Sight(self.model, problem.length, problem.modulus, problem.mirror, problem.azimuth, problem.reactions)
+        sense = copysign(1.0, problem.lambda_m)
+        place = problem.mirror, problem.azimuth
+        return Sight(self.model, problem.length, problem.modulus, *place, problem.reactions, sense)
 
     def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
         """The magnetised shell of a record as a source of magpylib, of charged triangles; collective.

@@ -37,11 +37,11 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     """
     load, name, h = step.load, step.name, scene.problem.material.h
     assert isinstance(load, ContactSection)
-    region = scene.model.touching(state, name)
+    region = scene.model.region(state, name)
     if region.penetration > NEAR * h or (load.approach is not None and load.approach <= state.mu[name]):
         return state
     for _ in range(MOST):
-        gap = -scene.model.touching(state, name).penetration / h
+        gap = -scene.model.region(state, name).penetration / h
         if gap <= NEAR:
             break
         state = state.with_(state.u, name, state.mu[name] + gap)
@@ -67,7 +67,7 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
     state, h, raised = stage.leave(high.state), stage.scene.problem.material.h, dict[str, float]()
     for contact in stage.scene.problem.loads.contacts:
         k = state.mu.get(contact.setting, contact.stiffness)
-        deep = stage.scene.model.touching(state, contact.amplitude).penetration
+        deep = stage.scene.model.region(state, contact.amplitude).penetration
         if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
             raised[contact.setting] = STIFFER * k
     for pair, deep in between(stage.scene, state):
@@ -164,7 +164,7 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
             said = "the body goes back the way it came: at its fold the shell snaps under a given approach"
             raise PathStopped(said, low, final=True)
     if max_abs(comm, high.du) == 0:
-        depths = [model.touching(stage.leave(point.state), name).penetration for point in (low, high)]
+        depths = [model.region(stage.leave(point.state), name).penetration for point in (low, high)]
         if depths[1] < min(depths[0], 0.0):
             said = "the body has left the shell: at its fold the shell snaps under a given approach"
             raise PathStopped(said, high, final=True)
@@ -180,7 +180,7 @@ def refuse_penetration(scene: Scene, state: State) -> None:
     """
     h = scene.problem.material.h
     for contact in scene.problem.loads.contacts:
-        deep = scene.model.touching(state, contact.amplitude).penetration / h
+        deep = scene.model.region(state, contact.amplitude).penetration / h
         if deep > contact.bound:
             k = state.mu.get(contact.setting, contact.stiffness)
             raise Stopped(
@@ -195,10 +195,10 @@ def refuse_penetration(scene: Scene, state: State) -> None:
             )
 
 
-def touching(scene: Scene, state: State) -> list[Contact]:
+def pressing(scene: Scene, state: State) -> list[Contact]:
     """The bodies that touch."""
     contacts = scene.problem.loads.contacts
-    return [contact for contact in contacts if scene.model.touching(state, contact.amplitude).penetration > 0]
+    return [contact for contact in contacts if scene.model.region(state, contact.amplitude).penetration > 0]
 
 
 def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
@@ -218,11 +218,11 @@ def rigid(scene: Scene, state: State) -> State:
     shell moves by at most `RIGID` times the penetration. A given stiffness stays.
     """
     for _ in range(MOST_RAISED):
-        bodies = [contact for contact in touching(scene, state) if not contact.given]
+        bodies = [contact for contact in pressing(scene, state) if not contact.given]
         harder = hardened(scene, state, bodies) if bodies else None
         if harder is None:
             break
-        deep = max(scene.model.touching(state, contact.amplitude).penetration for contact in bodies)
+        deep = max(scene.model.region(state, contact.amplitude).penetration for contact in bodies)
         state, moved = harder, _moved(scene, state, harder)
         if moved <= RIGID * deep:
             break

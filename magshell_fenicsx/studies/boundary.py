@@ -33,6 +33,7 @@ from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.numbers import BESIDE
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -44,7 +45,6 @@ from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, k
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
-ELSEWHERE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "identify", "output")
 STEPS, MOST_STEPS = 20, 1000
 ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 SPECIAL = ("cusp", "turn", "meeting")
@@ -104,7 +104,7 @@ def parse_range(text: str) -> Range:
         raise CaseError(f"--over {text}: first and last must be two different finite numbers")
     if not 1 <= steps <= MOST_STEPS:
         raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
-    if key.split(".")[0] in ELSEWHERE:
+    if key.split(".")[0] in BESIDE:
         raise CaseError(
             f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has no boundary"
         )

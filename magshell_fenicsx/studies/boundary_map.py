@@ -11,9 +11,10 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.simulate.numbers import BESIDE
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.varied import Excluded, NoInstability
-from magshell_fenicsx.studies.boundary import COLUMNS, ELSEWHERE, StabilityBoundary, boundary, parse_range
+from magshell_fenicsx.studies.boundary import COLUMNS, StabilityBoundary, boundary, parse_range
 from magshell_fenicsx.studies.boundary_picture import draw_map
 from magshell_fenicsx.studies.points import Axis, parse_axis
 from magshell_fenicsx.studies.runner import Folder, Made, Say
@@ -32,7 +33,7 @@ def second_axis(text: str, first: str) -> Axis:
         If it is no list of numbers of one other key.
     """
     axis = parse_axis(text)
-    if len(axis.keys) > 1 or axis.numbers is None or axis.name == first or axis.name.split(".")[0] in ELSEWHERE:
+    if len(axis.keys) > 1 or axis.numbers is None or axis.name == first or axis.name.split(".")[0] in BESIDE:
         raise CaseError(
             f"--over {text}: the second key of a map is another number of the shell or its loads, written as "
             "key.path=first:last:count or key.path=value,value,..."

@@ -5,9 +5,9 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section
-from magshell_fenicsx.studies.sections import Measured
+from magshell_fenicsx.studies.sections import TextWithUnit
 
-Amount = float | Measured
+Amount = float | TextWithUnit
 
 
 class ParameterSection(Section):

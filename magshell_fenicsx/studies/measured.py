@@ -20,7 +20,7 @@ Sample = dict[str, float | None]
 
 
 @dataclass
-class Measured:
+class Timings:
     """The measurements of a point.
 
     Attributes
@@ -53,11 +53,11 @@ class Measured:
 Origin = Mapping[str, str | None]  # the sources and the mesh file: keys of summary.json and their values
 
 
-def load(file: Path, machine: dict[str, Any], origin: Origin) -> Measured:
+def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
     """The usable measurements of an earlier study on this machine; empty without any."""
     content = _read(file)
     usable = content and content.machine == machine and not content.failure and _is_of(origin, content.summary)
-    return content if content and usable else Measured(machine)
+    return content if content and usable else Timings(machine)
 
 
 def of_others(file: Path, origin: Origin) -> bool:
@@ -66,8 +66,8 @@ def of_others(file: Path, origin: Origin) -> bool:
     return content is not None and content.summary is not None and not _is_of(origin, content.summary)
 
 
-def _read(file: Path) -> Measured | None:
-    known = kept(file, TypeAdapter(Measured))
+def _read(file: Path) -> Timings | None:
+    known = kept(file, TypeAdapter(Timings))
     return known if known and all(sample.keys() >= set(TIMES) for sample in known.samples) else None
 
 
@@ -75,7 +75,7 @@ def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:
     return summary is not None and all(summary.get(key) == value for key, value in origin.items())
 
 
-def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin) -> None:
+def complete(measured: Timings, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin) -> None:
     """Run until there are `repeat` samples; every run is on disk before the next.
 
     Parameters
@@ -99,7 +99,7 @@ def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: i
         keep(file, asdict(measured))
 
 
-def _run_once(measured: Measured, arguments: Sequence[str], ranks: int) -> Sample:
+def _run_once(measured: Timings, arguments: Sequence[str], ranks: int) -> Sample:
     with TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
         used = measure("magshell_fenicsx", ["run", *arguments, "--out", str(out)], ranks)

@@ -11,8 +11,8 @@ from magshell_fenicsx.input.section import Section, in_unit, number_and_unit
 
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
-Measured = Annotated[str, Field(pattern=r"^\s*[-+]?\.?[0-9]", examples=["20 mT"])]
-Amounts = Annotated[list[float | Measured], Field(min_length=2, max_length=2)]
+TextWithUnit = Annotated[str, Field(pattern=r"^\s*[-+]?\.?[0-9]", examples=["20 mT"])]
+Amounts = Annotated[list[float | TextWithUnit], Field(min_length=2, max_length=2)]
 
 
 class ShapeSection(Section):

@@ -15,7 +15,7 @@ from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version, fingerprint
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.studies.measured import Measured, complete, load, of_others
+from magshell_fenicsx.studies.measured import Timings, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute
@@ -168,7 +168,7 @@ def _write(done: Study, keys: Sequence[str], content: dict[str, Any], folder: Pa
     draw_study(done.rows, keys, title, own_error, folder / "study.png")
 
 
-def _outcome(measured: Measured, scalar: Scalar) -> str:
+def _outcome(measured: Timings, scalar: Scalar) -> str:
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
     value = scalar.of(measured.summary, measured.rows)

@@ -9,7 +9,7 @@ from typing import Any
 from scipy.optimize import brentq
 
 from magshell_fenicsx.platform.environment import described
-from magshell_fenicsx.studies.measured import TIMES, Measured
+from magshell_fenicsx.studies.measured import TIMES, Timings
 from magshell_fenicsx.studies.points import SweepPoint, short
 from magshell_fenicsx.studies.results import Scalar
 
@@ -99,7 +99,7 @@ class Run:
 
     point: SweepPoint
     ranks: int
-    measured: Measured
+    measured: Timings
 
     @property
     def label(self) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.parts.bodies.contact import penalty
+from magshell_fenicsx.parts.gap import penalty
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from benchmarks.contacts_in_time import CASES, SMALL, apart, imbalance, moved
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.parts.bodies.contact import mean_pressure, penalty
+from magshell_fenicsx.parts.gap import mean_pressure, penalty
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import imbalances, rows
 from magshell_fenicsx.simulate.follow import follow

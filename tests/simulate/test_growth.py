@@ -150,7 +150,7 @@ def test_stopped_and_resumed(no_pictures: None, tmp_path: Path) -> None:
     [
         ({"item": 1, "factor": 1}, {}, "loading.0.item: 1: shell.imperfections has no such item"),
         ({"factor": 1}, {"imperfections": ()}, "kind: imperfection: the case has none"),
-        ({"factor": 1}, {"model": "solid", "mesh": {}}, "is of a shell, not of a solid"),
+        ({"factor": 1}, {"model": "solid", "mesh": {}}, "needs a mid-surface; a solid has none"),
         ({"factor": 0}, {}, "the target must not be zero"),
     ],
 )

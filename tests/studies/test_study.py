@@ -14,7 +14,7 @@ from many import make_points, study
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.platform.processes import Usage, measure
 from magshell_fenicsx.studies import measured as sample
-from magshell_fenicsx.studies.measured import TIMES, Measured
+from magshell_fenicsx.studies.measured import TIMES, Timings
 from magshell_fenicsx.studies.points import parse_axes
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.study import parse_ranks
@@ -107,12 +107,12 @@ def test_no_order_where_there_is_none() -> None:
     assert estimated_error([1], [1.2]) == (None, None)
 
 
-def made(*measured: tuple[float | None, int, float]) -> tuple[list[Run], list[Measured]]:
+def made(*measured: tuple[float | None, int, float]) -> tuple[list[Run], list[Timings]]:
     """Runs of three refinements with (k_d, dofs, seconds)."""
     values = "1:3:3" if len(measured) == 3 else "1:2:2"
     points = make_points(DIMPLE, parse_axes([f"mesh.refinement={values}"]))
     kept = [
-        Measured(
+        Timings(
             {},
             dict.fromkeys(TIMES),
             [{**dict.fromkeys(TIMES), "wall_s": seconds + noise} for noise in (0.5, 0.0, -0.1)],

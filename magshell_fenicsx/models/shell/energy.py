@@ -122,7 +122,7 @@ def edge_quadrature(degree: int) -> int:
     return 2 * degree - 2
 
 
-class Measured(Protocol):
+class AtPoints(Protocol):
     """Computes energies without forms, see `residual.FastResidual`."""
 
     def energy(self, name: str) -> float:
@@ -132,7 +132,7 @@ class Measured(Protocol):
 class ShellTerm(DensityTerm[Density]):
     """A term of a shell; its energy comes from points where these are known."""
 
-    points: Measured | None = None
+    points: AtPoints | None = None
 
     def energy(self) -> float:
         return self.points.energy(self.name) if self.points else super().energy()

@@ -292,7 +292,7 @@ class PointFields:
         return found
 
     def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
-        """The deformed thickness over the undeformed one; see `parts.bodies.thinning`."""
+        """The deformed thickness over the undeformed one; see `parts.gap`."""
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
         if self._natural is None:

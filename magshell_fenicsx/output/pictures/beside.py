@@ -12,7 +12,7 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.view import (
     Camera,
     Image,
-    Seen,
+    InView,
     Tessellation,
     Window,
     in_pixels,
@@ -48,13 +48,13 @@ class Laid:
 class Beside:
     """The solids near a shell in its window, and where the shell hides them."""
 
-    def __init__(self, surface: Surface, camera: Camera, window: Window, shell: Seen) -> None:
+    def __init__(self, surface: Surface, camera: Camera, window: Window, shell: InView) -> None:
         self._camera, self._window, self._shell = camera, window, shell
         self._solids = near_solids(surface)
 
     @cached_property
-    def _seen(self) -> list[Seen]:
-        return [Seen(_pieces(solid), solid.points, self._camera, self._window) for solid in self._solids]
+    def _seen(self) -> list[InView]:
+        return [InView(_pieces(solid), solid.points, self._camera, self._window) for solid in self._solids]
 
     @cached_property
     def _visible(self) -> list[NDArray[np.bool_]]:
@@ -92,7 +92,7 @@ class Beside:
             found += self._edges(solid, seen)
         return found
 
-    def _edges(self, solid: Solid, seen: Seen) -> list[Array]:
+    def _edges(self, solid: Solid, seen: InView) -> list[Array]:
         if not (creases := solid.creases):
             return []
         divided = [_divided(line) for line in creases]

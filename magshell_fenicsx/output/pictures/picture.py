@@ -21,7 +21,7 @@ from magshell_fenicsx.output.pictures.colours import (
 )
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel, Pen, columns, drawing, panel_width, panels_figure
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
-from magshell_fenicsx.output.pictures.view import Camera, Image, Seen, Window, tessellated
+from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window, tessellated
 from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -94,11 +94,13 @@ class Background:
         self._surface, self._camera = surface, camera
         pieces, r = tessellated(surface), surface.r0 + surface.u
         self.window = window or Window.around(camera(np.concatenate([surface.r0, r, *near_places(surface)])), width)
-        self.seen = Seen(pieces, r, camera, self.window)
+        self.seen = InView(pieces, r, camera, self.window)
         self._beside = Beside(surface, camera, self.window, self.seen)
         coarse = replace(self.window, scale=self.window.scale / 2)  # enough for a line that is wider than a pixel
         drawn = silhouette(self.seen)
-        undeformed = apart(silhouette(Seen(pieces, surface.r0, camera, coarse)), drawn, SEEN_APART / self.window.scale)
+        undeformed = apart(
+            silhouette(InView(pieces, surface.r0, camera, coarse)), drawn, SEEN_APART / self.window.scale
+        )
         self._lines = (
             *((line, UNDEFORMED) for line in undeformed),
             *((line, EDGE) for line in drawn),
@@ -161,7 +163,7 @@ def apart(lines: Sequence[Array], others: Sequence[Array], distance: float) -> l
     return found
 
 
-def silhouette(seen: Seen) -> list[Array]:
+def silhouette(seen: InView) -> list[Array]:
     """Lines (n, 2) around the drawn part of a surface, in the projection; none where it goes on beyond the window."""
     import contourpy
 

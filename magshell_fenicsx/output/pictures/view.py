@@ -186,7 +186,7 @@ class Window:
         return Window((low[0] - spare, high[0] + spare, low[1], high[1]), width / (wide + 2 * spare))
 
 
-class Seen:
+class InView:
     """A deformed surface as it is seen in a window.
 
     Parameters
@@ -216,8 +216,8 @@ class Seen:
         return eye, to_lamp, float(lamp[2])
 
     @staticmethod
-    def of(surface: Surface, camera: Camera, window: Window) -> "Seen":
-        return Seen(tessellated(surface), surface.r0 + surface.u, camera, window)
+    def of(surface: Surface, camera: Camera, window: Window) -> "InView":
+        return InView(tessellated(surface), surface.r0 + surface.u, camera, window)
 
     @property
     def share(self) -> Array:

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, lengths_with_units, or_number
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.shape.ground import At, Coordinates
 from magshell_fenicsx.shape.solids import Solid
@@ -52,7 +53,7 @@ class Distance(ABC):
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedBody:
     """A body's place, dimensionless and in the model's frame.
 
     Attributes
@@ -139,7 +140,7 @@ class BodySection(Section):
             return self.kind
         return f"{self.kind} of radius " + (f"{1e3 * radius:g} mm" if with_units else f"{radius:g}")
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         """Its distance where it stands.
 
         Raises
@@ -158,7 +159,9 @@ class BodySection(Section):
         return self
 
 
-def place_body(section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float) -> Placed:
+def place_body(
+    section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float
+) -> PlacedBody:
     """Where a body is.
 
     Parameters
@@ -175,7 +178,7 @@ def place_body(section: BodySection, key: str, place: Array, normal: Array, half
     front = Q @ (place + half * out)
     if section.position is not None:
         front = Q @ (np.array(section.position) / R) + ahead * d
-    return Placed(key, front, front - ahead * d, d, Q, R)
+    return PlacedBody(key, front, front - ahead * d, d, Q, R)
 
 
 def _not_short(v: Sequence[float]) -> Array:
@@ -183,21 +186,25 @@ def _not_short(v: Sequence[float]) -> Array:
     return np.array(v, dtype=float) / max(map(abs, v))
 
 
-def refuse_unfit_bodies(bodies: Mapping[str, BodySection], *, solid: bool) -> None:
-    """Refuse names, and bodies beside a solid."""
-    for name in bodies:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
-            raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
-        if name in endings():
-            raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
-    if bodies and solid:
-        raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
+class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
+    """All bodies of a case."""
 
+    key = "bodies"
 
-def with_units(bodies: Mapping[str, BodySection], written: Mapping[str, Any] | None) -> Iterator[str]:
-    """The keys of bodies that are text with a unit in plain data."""
-    for name, body in (written or {}).items():
-        yield from lengths_with_units(type(bodies[name]), body, f"bodies.{name}.")
+    def refuse_unfit(self, context: Context) -> None:
+        """Refuse names and places, and bodies beside a solid."""
+        for name, body in self.given.items():
+            context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
+                raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
+            if name in endings():
+                raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
+        patch = "of a solid give a force on a patch (kind: indentation, patch)"
+        context.needs("bodies", "a mid-surface", hint=patch)
+
+    def lengths(self, data: Mapping[str, Any]) -> Iterator[str]:
+        for name, body in data["bodies"].items():
+            yield from lengths_with_units(type(self.given[name]), body, f"bodies.{name}.")
 
 
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:

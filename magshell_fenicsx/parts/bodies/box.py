@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size, rounded
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size, rounded
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import edges
 from magshell_fenicsx.shape.solids import Solid
@@ -42,7 +42,7 @@ class BoxSection(BodySection):
             raise ValueError("edge: a rounding is at most half of the smallest size")
         return self
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         half = np.array(self.size) / placed.R / 2
         return Box(placed.centre, placed.axes(self.axis), half, self.edge / placed.R)
 

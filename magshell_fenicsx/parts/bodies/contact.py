@@ -23,14 +23,12 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
-from magshell_fenicsx.parts.bodies.thinning import Thinning, thinned
+from magshell_fenicsx.parts.gap import SOFT, Thinning, mean_pressure, penalty, thinned
 
 Array = NDArray[np.float64]
-SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
 FACE = 1 + 1 + 3 + 1  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
-ROUNDING = 1e-5  # of the soft penetration: a smaller change of it is no divisor
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
 
@@ -84,27 +82,6 @@ class Contact:
     def setting(self) -> str:
         """Name of its stiffness among the amplitudes of a state, where it was raised."""
         return f"stiffness_{self.body}"
-
-
-def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
-    """psi of a penetration s with two derivatives: psi'' grows from 0 to k over `soft`, and is continuous."""
-    t = np.maximum(s, 0.0)
-    full = t > soft
-    second = np.where(full, k, k * t / soft)
-    first = np.where(full, k * (t - soft / 2), k * t**2 / (2 * soft))
-    value = np.where(full, k * (t**2 / 2 - t * soft / 2 + soft**2 / 6), k * t**3 / (6 * soft))
-    return value, first, second
-
-
-def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:
-    """(psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1."""
-    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft), penalty(s1, k, soft)
-    _, middle, stiff = penalty((s0 + s1) / 2, k, soft)
-    simpson, slope = (p0 + 4 * middle + p1) / 6, (2 * stiff + k1) / 6  # exact where psi'' has no kink between
-    across = (np.digitize(s0, (0.0, soft)) != np.digitize(s1, (0.0, soft))) & (np.abs(s1 - s0) > ROUNDING * soft)
-    ds = np.where(across, s1 - s0, 1.0)
-    mean = np.where(across, (v1 - v0) / ds, simpson)
-    return mean, np.where(across, (p1 - mean) / ds, slope)
 
 
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:

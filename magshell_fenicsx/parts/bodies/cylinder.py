@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size
 from magshell_fenicsx.parts.bodies.sphere import Sphere
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import SEEN, frame, upright
@@ -29,7 +29,7 @@ class CylinderSection(BodySection):
     def ahead(self) -> float:
         return self.radius
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         return Cylinder(placed.centre, placed.across(self.axis), self.radius / placed.R)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import ball
 from magshell_fenicsx.shape.solids import Solid
@@ -39,7 +39,7 @@ class EllipsoidSection(BodySection):
         """The smaller radius of curvature of its front, in the case's unit."""
         return min(self.semi_axes[:2]) ** 2 / self.semi_axes[2]
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         return Ellipsoid(placed.centre, placed.axes(self.axis), np.array(self.semi_axes) / placed.R)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import SEEN, circle, frame
 from magshell_fenicsx.shape.solids import Solid
@@ -19,7 +19,7 @@ class PlaneSection(BodySection):
 
     kind: Literal["plane"]
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         return Plane(placed.front, placed.direction)
 
 

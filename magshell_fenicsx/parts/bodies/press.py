@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.input.section import over
+from magshell_fenicsx.input.section import Name, over
 from magshell_fenicsx.parts.course import Control, Course, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Step
-from magshell_fenicsx.parts.supports.motion import Name
 from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 
 if TYPE_CHECKING:
@@ -162,7 +161,7 @@ class BodiesSeen(Seen):
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         model, h, values = sight.model, sight.h, dict[str, float]()
         for name in model.contacts:
-            at, force = model.touching(state, name), sight.potential(state, name)
+            at, force = model.region(state, name), sight.potential(state, name)
             numbers = (state.mu[name], -force / self._unit(sight), at.penetration / h)
             radii = (sight.length * radius for radius in (at.radius, at.inner, at.outer))
             k = float(model.contacts[name][0].stiffness.value)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size, rounded
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody, Size, rounded
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import SEEN, frame, upright
 from magshell_fenicsx.shape.solids import Solid
@@ -30,7 +30,7 @@ class RodSection(BodySection):
             raise ValueError("edge: a rounding is no larger than the radius")
         return self
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         return Rod(placed.front, placed.direction, self.radius / placed.R, self.edge / placed.R)
 
 

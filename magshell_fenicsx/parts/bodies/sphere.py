@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody, Size
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import ball
 from magshell_fenicsx.shape.solids import Solid
@@ -25,7 +25,7 @@ class SphereSection(BodySection):
     def ahead(self) -> float:
         return self.radius
 
-    def distance(self, placed: Placed) -> Distance:
+    def distance(self, placed: PlacedBody) -> Distance:
         return Sphere(placed.centre, self.radius / placed.R)
 
 

@@ -53,8 +53,7 @@ class ImperfectionStep(PathStep):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         keys: Mapping[str, object] = context.sections["imperfections"]
         names = context.loads(ImperfectionStep)
-        if context.solid:
-            raise ValueError(f"{step.key}.kind: imperfection: is of a shell, not of a solid")
+        context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
         if not keys:
             raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
         if not grown_by([step], keys)[step.name]:

@@ -1,17 +1,18 @@
 """What all imperfections have in common: their sections, sizes with units, and what they bring to a problem."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from math import inf, sqrt
+from math import inf, radians, sqrt
 from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
 
-from magshell_fenicsx.input.section import Section, in_units, with_unit
+from magshell_fenicsx.input.section import Section, in_units, lengths_with_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.shape.ground import At, Distance, Ground, located
 
 Array = NDArray[np.float64]
@@ -280,6 +281,30 @@ def _refuse_steep(depth: float, slope: float) -> None:
         raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
     if slope > 2:
         raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
+
+
+class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
+    """All imperfections of a case, by their keys below `shell`."""
+
+    key = "imperfections"
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that the shell can have them."""
+        shell = context.shell
+        if getattr(shell, "defect", None) and shell.imperfections:
+            raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
+        edge = None if shell.edge_polar is None else radians(shell.edge_polar)
+        for key, section in self.given.items():
+            try:
+                section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
+            except ValueError as e:
+                raise ValueError(f"shell.{key}: {e}") from None
+
+    def lengths(self, data: Mapping[str, Any]) -> Iterator[str]:
+        written = {f"imperfections.{i}": item for i, item in enumerate(data["shell"].get("imperfections") or [])}
+        written |= {"defect": item} if (item := data["shell"].get("defect")) else {}
+        for key, item in written.items():
+            yield from lengths_with_units(type(self.given[key]), item, f"shell.{key}.")
 
 
 def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:

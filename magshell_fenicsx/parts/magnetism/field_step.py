@@ -11,7 +11,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target, Until
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -108,7 +108,7 @@ class RotationSection(Step):
     with it, about the origin; the direction of formulas, and of sources that are the whole field, is e3 at first.
     """
 
-    amplitude: ClassVar[str] = "angle"
+    amplitude: ClassVar[str] = ANGLE
     holdable: ClassVar[bool] = False
     kind: Literal["rotation"]
     to: Direction

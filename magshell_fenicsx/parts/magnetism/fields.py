@@ -1,6 +1,6 @@
 """The magnetisation and the applied field."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from math import isnan, pi, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -11,13 +11,14 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
 from magshell_fenicsx.input.messages import shown
-from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrOfProgram
+from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrOfProgram, Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
-from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
-from magshell_fenicsx.quantities.quantity import Given, Quantity
-from magshell_fenicsx.quantities.registry import register
+from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
+from magshell_fenicsx.quantities.quantity import Given
+from magshell_fenicsx.shape.revolved import SurfaceSection
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
@@ -29,19 +30,7 @@ SOURCES = 1e-9  # of the field's derivatives: rounding
 LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
 MOST_SOFT = 1e6  # of a susceptibility
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
-INDUCED = tuple(f"induced_{axis}" for axis in "xyz")
-register(
-    tuple(
-        Quantity(
-            name,
-            f"induced polarisation along e{number}",
-            f"Mean over the soft shell of the polarisation μ0 M that the field induces, along e{number}; in T, without "
-            "units over that of λ_m = 1.",
-            "load",
-        )
-        for number, name in enumerate(INDUCED, 1)
-    )
-)
+ANGLE = "angle"  # amplitude of a step that turns the field
 
 
 class Layer(Direction):
@@ -181,7 +170,7 @@ Susceptibility = Annotated[
 ]
 
 
-class MagneticSection(Ability):
+class MagneticSection(Section, Ability):
     """lambda_m, or both flux densities (and shell.youngs_modulus).
 
     A shell with a susceptibility and without `remanent` is soft alone: λ_m = |B^a|/√(μ0 E), or applied.flux_density.
@@ -291,7 +280,8 @@ class MagneticSection(Ability):
         if self.without_field:
             return 0.0
         assert self.applied.reference is not None
-        assert youngs_modulus
+        if youngs_modulus is None:
+            raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         return self.applied.reference / self.tesla(youngs_modulus)
 
     def tesla(self, youngs_modulus: float) -> float:
@@ -300,6 +290,57 @@ class MagneticSection(Ability):
             return sqrt(MU_0 * youngs_modulus)
         assert self.remanent.flux_density is not None
         return MU_0 * youngs_modulus / self.remanent.flux_density
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that its field has a strength, and that the shell has what its energies need."""
+        shell, sensors = context.shell, context.sections.get("sensors")
+        self.amplitude(shell.youngs_modulus)
+        if self.applied.sources and not shell.with_units:
+            raise ValueError(
+                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
+            )
+        by_densities = self.lambda_m is None and not self.without_field
+        if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
+            raise ValueError(
+                "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
+                "or lambda_m"
+            )
+        if self.without_field and not sensors and self.interaction == "none":
+            raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
+        if self.interaction != "none":
+            context.needs(
+                f"magnetic.interaction: {self.interaction}",
+                "the whole shell",
+                "a mid-surface",
+                "a thickness that does not change",
+            )
+        if self.energy != "full":
+            expanded = f"magnetic.energy: {self.energy}"
+            context.needs(expanded, "a mid-surface", "a thickness that does not change", hint="or give energy: full")
+        if self.remanent and isinstance(self.remanent.components, GivenField):
+            context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
+        layers = self.remanent.layers if self.remanent else None
+        if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
+            raise ValueError(
+                "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
+                "knows no more of them"
+            )
+        patches = self.remanent.patches if self.remanent else None
+        if patches and "rest" not in patches and not isinstance(shell, MeshSurface):
+            raise ValueError("magnetic.remanent: patches needs the patch rest")
+
+    def in_time(self, context: Context, driven: Collection[str]) -> InTime:
+        why = "not after kind: rotation" if ANGLE in driven else ""
+        if not strength(context):
+            why = "needs magnetic.lambda_m, not zero"
+        return InTime("field", self.applied.flux_density not in (None, 0.0), why)
+
+    def patches(self) -> dict[str, Iterable[str]]:
+        values = {
+            "magnetic.remanent.patches": self.remanent and self.remanent.patches,
+            "magnetic.susceptibility": self.susceptibility,
+        }
+        return {key: value for key, value in values.items() if isinstance(value, dict)}
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
@@ -323,10 +364,8 @@ class MagneticSection(Ability):
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
         from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
-        from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_sensors
         from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
 
-        refuse_unfit_sensors(context)
         refuse_unfit_interaction(context)
         lambda_m = strength(context)
         largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell

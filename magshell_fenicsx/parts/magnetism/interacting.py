@@ -1,17 +1,16 @@
 """Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees of it."""
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 
-from magshell_fenicsx.assembly.connected import pieces
+from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
@@ -25,43 +24,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 LARGEST = 9000  # unknowns: a matrix of 650 MB
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The cells of all ranks.
-
-    Attributes
-    ----------
-    nodes
-        (cells, k) global numbers.
-    own
-        Those of this rank.
-    parts
-        (cells,) numbers of the connected components.
-    to_nodes
-        (nodes, cells k) with ones.
-    """
-
-    nodes: Ints
-    own: range
-    parts: Ints
-    to_nodes: csr_array
-
-    @classmethod
-    def of(cls, V: fem.FunctionSpace) -> "Cells":
-        """Of a space; collective."""
-        comm, index = V.mesh.comm, V.dofmap.index_map
-        owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
-        local = V.dofmap.list[:owned]
-        mine = index.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-        every = comm.allgather(mine)
-        nodes = np.concatenate(every).astype(np.intp)
-        first = sum(len(each) for each in every[: comm.rank])
-        count = index.size_global
-        parts = np.concatenate(comm.allgather(pieces(V)[local[:, 0]]))
-        cells = np.ones(nodes.size), (nodes.ravel(), np.arange(nodes.size))
-        return cls(nodes, range(first, first + owned), parts, coo_array(cells, (count, nodes.size)).tocsr())
 
 
 class InteractionTerm:
@@ -81,9 +43,13 @@ class InteractionTerm:
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
-        self._cells = Cells.of(V)
+        self._cells = CellsOfAll.of(V)
+        nodes = self._cells.nodes
+        ones = np.ones(nodes.size), (nodes.ravel(), np.arange(nodes.size))
+        self._to_nodes = coo_array(ones, (V.dofmap.index_map.size_global, nodes.size)).tocsr()  # from those of cells
+        self._parts = self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]])  # of each cell
         unknowns = 3 * V.dofmap.index_map.size_global
-        if self._cells.parts.max() == 0:
+        if self._parts.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between parts of a mesh file that are not connected, and the shell "
                 "is one part: take interaction: none, or a mesh of several parts"
@@ -121,7 +87,7 @@ class InteractionTerm:
 
         def add(row: int, stiffness: Array) -> None:
             flat = stiffness.reshape(3 * k, -1, 3).transpose(1, 0, 2).reshape(-1, 9 * k)
-            summed = (self._cells.to_nodes @ flat).reshape(-1, k, 3, 3).transpose(1, 2, 0, 3)
+            summed = (self._to_nodes @ flat).reshape(-1, k, 3, 3).transpose(1, 2, 0, 3)
             rows[local[row]] += factor * self._scale * summed
 
         try:
@@ -143,9 +109,9 @@ class InteractionTerm:
 
     def _nodes(self) -> Array:
         """(cells, k, 3) the deformed nodes of all cells; what is charged is renewed where it has changed."""
-        r0, u = (self._whole(f) for f in (self._model.r0, self._u))
+        r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
-        given = r0, self._over_ranks(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list], cells=True)
+        given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._seen = given, None
             self.__dict__.pop("_charged", None)
@@ -154,22 +120,14 @@ class InteractionTerm:
     @cached_property
     def _charged(self) -> Charged:
         own = own_field(self._sight)
-        shape, (cells, edges) = own._shape({}), own._edges
-        thick = shape.thick and (shape.thick[0], self._over_ranks(shape.thick[1], cells=True))
+        shape, (cells, edges) = own.shape({}), own.edges
+        thick = shape.thick and (shape.thick[0], self._cells.gathered(shape.thick[1]))
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
-        whole = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
-        at = self._over_ranks(np.asarray(cells) + self._cells.own.start), self._over_ranks(np.asarray(edges))
-        return Charged(whole, self._cells.parts, *at, self._comm)
+        everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
+        own_cells, every = np.asarray(cells) + self._cells.own.start, self._comm
+        at = over_ranks(every, own_cells), over_ranks(every, np.asarray(edges))
+        return Charged(everywhere, self._parts, *at, self._comm)
 
     @property
     def _sight(self) -> Sight:
         return Sight(self._model, 1.0, 1.0, None, 0.0, False)
-
-    def _whole(self, f: fem.Function) -> Array:
-        """(nodes, 3) of all ranks."""
-        owned = f.function_space.dofmap.index_map.size_local
-        return self._over_ranks(f.x.array[: 3 * owned].reshape(-1, 3))
-
-    def _over_ranks(self, values: NDArray[Any], *, cells: bool = False) -> NDArray[Any]:
-        own = values[: len(self._cells.own)] if cells else values
-        return np.concatenate(self._comm.allgather(own)) if self._comm.size > 1 else np.array(own)

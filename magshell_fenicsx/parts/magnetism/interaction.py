@@ -128,14 +128,6 @@ def refuse_unfit_interaction(context: Context) -> None:
             f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file that are not connected: "
             "take geometry: mesh, or interaction: none"
         )
-    if context.shell.law != "koiter":
-        raise CaseError(
-            f"magnetic.interaction: {magnetic.interaction}: is of a thickness that does not change: take law: koiter"
-        )
-    if context.solid:
-        raise CaseError(
-            f"magnetic.interaction: {magnetic.interaction}: is of shells, not of a solid: leave out model: solid"
-        )
     if context.whole and AMPLITUDE not in {step.name for step in context.steps}:
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: no step of the programme drives it: begin loading with a "

@@ -1,7 +1,7 @@
 """The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,6 @@ from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.softness import parity
 from magshell_fenicsx.parts.seen import Sight
-
-if TYPE_CHECKING:
-    pass
 
 Array = NDArray[np.float64]
 JUMP = 1e-6  # of the remanence between two cells, relative
@@ -41,12 +38,19 @@ class OwnField:
     ----------
     sight
         The model; its system has the displacement and the amplitudes that are asked about.
+
+    Attributes
+    ----------
+    magnetised
+        What is magnetised.
+    edges
+        Cells of this rank and their local edges that may be charged.
     """
 
     def __init__(self, sight: Sight) -> None:
         found = magnetised(sight.loads)
         assert found
-        self._sight, self._model, self._field = sight, sight.model, found
+        self._sight, self._model, self.magnetised = sight, sight.model, found
         V = sight.model.r0.function_space
         topology = V.mesh.topology
         self._dim = topology.dim
@@ -59,13 +63,13 @@ class OwnField:
         if not self._plain:
             carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
             self._at = carrier.discontinuous(3).element.basix_element
-        self._edges = self._sides()
+        self.edges = self._sides()
         self._sign = self._parity(pattern)
 
     def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
         """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
-        shape = self._shape(mu)
-        cells, edges = self._sides(every=True) if may else self._edges
+        shape = self.shape(mu)
+        cells, edges = self._sides(every=True) if may else self.edges
         faces = Faces(shape, np.arange(self._owned), may=may)
         return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
 
@@ -77,7 +81,7 @@ class OwnField:
                 raise TooNear
             found = field(families, x[None])[0]
             if mirror := self._sight.mirror:
-                sign = self._signed(mu)
+                sign = self.sign_of_images(mu)
                 found = found + sign * mirror.reflection @ field(families, mirror.image(x)[None])[0]
         except TooNear:
             found = np.full(3, np.nan)
@@ -91,7 +95,7 @@ class OwnField:
             into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
             gradient(families, x, e, into)
             if mirror := self._sight.mirror:
-                gradient(families, mirror.image(x), self._signed(mu) * mirror.reflection @ e, into)
+                gradient(families, mirror.image(x), self.sign_of_images(mu) * mirror.reflection @ e, into)
             parts.append(into)
         into = Nodal(parts[0].by_u, parts[-1].by_remanence)
         return into if self._plain else self._to_material(into, mu)
@@ -100,10 +104,11 @@ class OwnField:
         """The integral of the remanence as the shell carries it over its volume, (3,) over R³; collective."""
         found = np.asarray(self._model.system.comm.allreduce(moment(families)))
         if mirror := self._sight.mirror:
-            found = found + self._signed(mu) * mirror.reflection @ found
+            found = found + self.sign_of_images(mu) * mirror.reflection @ found
         return found
 
-    def _shape(self, mu: Mapping[str, float]) -> Shape:
+    def shape(self, mu: Mapping[str, float]) -> Shape:
+        """Its shape and remanence at the displacement that the system has."""
         model, V = self._model, self._model.r0.function_space
         element, nodes, size = V.element.basix_element, V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (f.x.array.reshape(-1, size)[nodes] for f in (model.r0, model.system.u))
@@ -136,7 +141,7 @@ class OwnField:
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
         """F^-1 of the polarisation per undeformed volume, (cells, nodes, 3), over |Br|."""
-        frame, of = TangentFrame.of(np.concatenate([r0, 0 * r0])), self._field
+        frame, of = TangentFrame.of(np.concatenate([r0, 0 * r0])), self.magnetised
         n = frame.normal(u)
         J = np.zeros_like(n)
         if not (of.soft and of.soft.alone):
@@ -232,7 +237,7 @@ class OwnField:
         T = self.Br.function_space.element.basix_element.tabulate(0, middles)[0, :, :, 0]
         return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
 
-    def _signed(self, mu: Mapping[str, float]) -> float:
+    def sign_of_images(self, mu: Mapping[str, float]) -> float:
         """1 if the mirror images of what is magnetised continue it, -1 if their opposites do."""
         sign = self._sign
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
@@ -253,11 +258,10 @@ class OwnField:
 def own_field(sight: Sight) -> OwnField:
     """That of a model, which keeps it until another remanence takes the place of its own."""
     model, of = sight.model, magnetised(sight.loads)
-    known = vars(model).get("own_field")
-    if known is None or known[0] is not of:
-        known = vars(model)["own_field"] = (of, OwnField(sight))
-    found: OwnField = known[1]
-    return found
+    known = model.kept.get(OwnField)
+    if known is None or known.magnetised is not of:
+        known = model.kept[OwnField] = OwnField(sight)
+    return known
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
@@ -285,7 +289,7 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
         _, families = own.families(state.mu)
         found = [each for family in families for each in triangles(family, parts)]
         if mirror:
-            sign = own._signed(state.mu)
+            sign = own.sign_of_images(state.mu)
             found += [(mirror.image(x), sign * q) for x, q in found]
         return found
 

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.magnetism.fields import INDUCED, MU_0
+from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.seen import Seen, Sight, Slope
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import register
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
@@ -21,6 +23,19 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
+INDUCED = tuple(f"induced_{axis}" for axis in "xyz")
+register(
+    tuple(
+        Quantity(
+            name,
+            f"induced polarisation along e{number}",
+            f"Mean over the soft shell of the polarisation μ0 M that the field induces, along e{number}; in T, without "
+            "units over that of λ_m = 1.",
+            "load",
+        )
+        for number, name in enumerate(INDUCED, 1)
+    )
+)
 
 
 class SoftSeen(Seen):

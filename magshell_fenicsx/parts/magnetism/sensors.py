@@ -1,5 +1,6 @@
 """Sensors of the magnetic field: where they are, and what they read."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import nan, sqrt
 from typing import Annotated, Literal
@@ -12,7 +13,7 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 
@@ -86,30 +87,38 @@ def units(context: Context) -> tuple[float, float]:
     return (Br, magnetic.tesla(E)) if Br and E else (Br or 1.0, nan)
 
 
-def refuse_unfit_sensors(context: Context) -> None:
-    """See that something is magnetised, and that no sensor is in the undeformed shell.
+class Sensing(KeyAbility[Mapping[str, SensorSection]]):
+    """All sensors of a case."""
 
-    Raises
-    ------
-    CaseError
-        With the key of the sensor.
-    """
-    given: dict[str, SensorSection] = context.sections.get("sensors") or {}
-    for name, each in given.items():
-        if not name.isidentifier():
-            raise CaseError(f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns")
-        if each.field == "total" and not np.isfinite(units(context)[1]):
-            raise CaseError(
-                f"sensors.{name}.field: total: lambda_m does not say how strong the applied field is: give "
-                "remanent.flux_density and applied.flux_density, or field: own"
-            )
-        shell = context.shell
-        if not isinstance(shell, MeshSurface) and depth(shell, np.array(each.position) / shell.reference) < 0:
-            x, y, z = each.position
-            raise CaseError(
-                f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
-                "mid-surface: place it outside"
-            )
+    key = "sensors"
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that something is magnetised, whose field can be read."""
+        if context.of(MagneticSection) is None:
+            raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
+        context.needs("sensors", "the whole shell", "a mid-surface")
+        if context.shell.rubber is not None:  # its thickness follows from its area
+            context.needs("sensors", "the area as drawn")
+
+    def refuse_unfit_values(self, context: Context, places: Array) -> None:
+        """See that no sensor is in the undeformed shell."""
+        for name, each in self.given.items():
+            if not name.isidentifier():
+                raise CaseError(
+                    f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns"
+                )
+            if each.field == "total" and not np.isfinite(units(context)[1]):
+                raise CaseError(
+                    f"sensors.{name}.field: total: lambda_m does not say how strong the applied field is: give "
+                    "remanent.flux_density and applied.flux_density, or field: own"
+                )
+            shell = context.shell
+            if not isinstance(shell, MeshSurface) and depth(shell, np.array(each.position) / shell.reference) < 0:
+                x, y, z = each.position
+                raise CaseError(
+                    f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
+                    "mid-surface: place it outside"
+                )
 
 
 def depth(shell: "ShellSection | Surface", x: Array) -> float:

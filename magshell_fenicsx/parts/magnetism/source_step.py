@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.section import Finite, Lengths, Name, Section
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
@@ -14,7 +14,6 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
-from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
 from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, TURN, WAY, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 

@@ -1,15 +1,16 @@
 """A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the viscosity of a shell."""
 
 import re
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, Protocol, TypeAlias
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, with_unit
-from magshell_fenicsx.parts.natural.section import NaturalSection
+from magshell_fenicsx.parts.part import Ability, Context
 
 Value = Callable[[Any], float]  # a time or a level as a plain number
 Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
@@ -174,38 +175,28 @@ class BranchSection(Section):
 Branches = Annotated[list[BranchSection], Field(max_length=20)]
 
 
-class Viscous(Protocol):
-    """What has these keys."""
+@dataclass(frozen=True)
+class Viscosity(Ability):
+    """Of a shell."""
 
     viscosity: float | str | None
-    relaxation: list[BranchSection]
-    youngs_modulus: float | None
+    branches: Sequence[BranchSection]
 
+    @classmethod
+    def of(cls, context: Context) -> "Viscosity | None":
+        shell = context.shell
+        return cls(shell.viscosity, shell.relaxation) if shell.viscosity is not None or shell.relaxation else None
 
-def refuse_unfit_viscosity(shell: Viscous, natural: NaturalSection | None, *, density: bool, solid: bool) -> None:
-    """See that its numbers are positive and that their units have a meaning.
-
-    Parameters
-    ----------
-    density
-        Whether times and moduli may have units.
-    solid
-        Whether the model is a solid.
-
-    Raises
-    ------
-    ValueError
-        With the key and what is allowed.
-    """
-    times = {"viscosity": shell.viscosity, **{f"relaxation.{i}.time": b.time for i, b in enumerate(shell.relaxation)}}
-    moduli = {f"relaxation.{i}.modulus": b.modulus for i, b in enumerate(shell.relaxation)}
-    for key, value in (times | moduli).items():
-        unit = "pascal" if key in moduli else "second"
-        if value is None:
-            continue
-        if solid or (natural and natural.stretch):
-            raise ValueError(f"shell.{key}: is of a shell, not of a solid, and not with natural.stretch")
-        if in_units(unit)(value) <= 0:
-            raise ValueError(f"shell.{key}: {value}: must be positive")
-        if isinstance(value, str) and not density:
-            raise ValueError(f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths")
+    def refuse_unfit(self, context: Context) -> None:
+        """See that its numbers are positive and that their units have a meaning."""
+        times = {f"relaxation.{i}.time": branch.time for i, branch in enumerate(self.branches)}
+        moduli = {f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)}
+        if self.viscosity is not None:
+            times = {"viscosity": self.viscosity, **times}
+        units = context.time_unit is not None and context.shell.with_units
+        for key, value in (times | moduli).items():
+            context.needs(f"shell.{key}", "a mid-surface", "the area as drawn")
+            if in_units("pascal" if key in moduli else "second")(value) <= 0:
+                raise ValueError(f"shell.{key}: {value}: must be positive")
+            if isinstance(value, str) and not units:
+                raise ValueError(f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths")

@@ -9,8 +9,6 @@ from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.course import Ahead, Errors
-from magshell_fenicsx.parts.magnetism.field_step import RotationSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
+NO_FIELD = "needs magnetic.lambda_m, not zero"
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
 
 
@@ -129,18 +128,16 @@ class TimeSection(Step):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         key, driven = step.key, context.driven_before(step.number)
-        field = strength(context)
-        if "field" in self.history and (not field or RotationSection.amplitude in driven):
-            why = "not after kind: rotation" if field else "needs magnetic.lambda_m, not zero"
+        timed = {each.name: each for ability in context.abilities if (each := ability.in_time(context, driven))}
+        if "field" in self.history and (why := timed["field"].refused if "field" in timed else NO_FIELD):
             raise ValueError(f"{key}.history.field: {why}")
         for where, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
                     f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
                 )
-        loads, magnetic = {each.name: each.load for each in context.steps}, context.of(MagneticSection)
+        loads = {each.name: each.load for each in context.steps}
         allowed = {"field", "pressure", *loads} - {"lambda_m", "angle", "time"}
-        measured = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
         for name, history in self.history.items():
             if name not in allowed:
                 raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
@@ -149,7 +146,7 @@ class TimeSection(Step):
             if jumps and name in loads and not loads[name].jumps:
                 raise ValueError(f"{key}.history.{name}: a support cannot jump")
             for level in levels_of(history):
-                if isinstance(level, str) and not (name == "field" and measured):
+                if isinstance(level, str) and not (name in timed and timed[name].with_units):
                     why = (
                         "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
                     )

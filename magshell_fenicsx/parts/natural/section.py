@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, in_units
+from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, Section, in_units
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.course import Target, Until
-from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
+from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled, Offer
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -78,7 +78,7 @@ Values = Annotated[
 ]
 
 
-class NaturalSection(Ability):
+class NaturalSection(Section, Ability):
     """The curvature and the size that the shell would have without stress: growth, swelling, pre-stretch.
 
     Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1
@@ -112,6 +112,23 @@ class NaturalSection(Ability):
     def texts(self) -> list[str]:
         """The formulas of the curvature and the stretch."""
         return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
+
+    def refuse_unfit(self, context: Context) -> None:
+        """A function of a program is one of the mid-surface."""
+        if self.given:
+            context.needs("natural", "a mid-surface", hint="of a solid give numbers and formulas")
+
+    def withdraws(self, context: Context) -> dict[Offer, str]:
+        """A stretch makes a shell larger than it was drawn, without stress."""
+        return {} if self.stretch is None else {"the area as drawn": "leave out natural.stretch"}
+
+    def lengths(self, data: Mapping[str, Any]) -> list[str]:
+        """Curvatures are over a length."""
+        return measured(data.get("natural"))
+
+    def patches(self) -> dict[str, Iterable[str]]:
+        values = {f"natural.{key}": getattr(self, key) for key in ("curvature", "stretch")}
+        return {key: value for key, value in values.items() if isinstance(value, dict)}
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.natural.planned import leaves  # the solver takes long to import

@@ -26,6 +26,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.following import at_quadrature
 from magshell_fenicsx.input.expressions import Together
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
@@ -204,6 +205,21 @@ class Shape:
     def parameters(self) -> tuple[Parameter, ...]:
         """The field, and the amplitudes that there are."""
         return (self.field, *(p for p in (self.curvature, self.stretch) if p is not None))
+
+    @property
+    def values(self) -> tuple[Array, ...] | None:
+        """On which the natural volume depends; None if that is the undeformed one."""
+        return None if self.stretch is None else (self.field.x.array, self.stretch.value)
+
+    def volume(self, first: Array, points: Array) -> Array:
+        """Natural over undeformed volume (cells, places), of a surface with these tangents (2, cells, places, 3)."""
+        assert self.stretch is not None
+        numbers = float(self.stretch.value) * at_quadrature(self.field, points)
+        T = np.empty((*numbers.shape[:2], 3, 3))
+        T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
+        a = np.moveaxis(first, 0, -2)
+        mixed = np.linalg.solve(a @ np.swapaxes(a, -1, -2), a @ T @ np.swapaxes(a, -1, -2))
+        return np.asarray(np.linalg.det(np.eye(2) + mixed) * (1 + numbers[..., 12]))
 
     def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
         """The natural forms at a point where the field and the amplitudes have these values."""

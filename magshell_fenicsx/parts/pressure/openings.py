@@ -12,8 +12,9 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import STRAIGHT
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.parts.supports.supports import STRAIGHT
 
 Array = NDArray[np.float64]
 
@@ -95,6 +96,12 @@ def ring_openings(ends: Mapping[str, Array], conditions: Mapping[str, Condition]
 
     names = moving({name: {name} for name in ends}, conditions)
     return names, without_potential(names, conditions, ring)
+
+
+def meridian_openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
+    """The ends that are not held, and those of them where a live pressure has no potential."""
+    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
+    return ring_openings(places, conditions)
 
 
 def no_potential(names: Sequence[str]) -> str:

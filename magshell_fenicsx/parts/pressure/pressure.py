@@ -14,7 +14,8 @@ from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
-from magshell_fenicsx.shape.sections import CapSurface, ShellSection, Surface
+from magshell_fenicsx.shape.revolved import CapSurface
+from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
 
@@ -83,6 +84,12 @@ class PressureSeen(Seen):
         if name != PressureSection.amplitude:
             return None
         return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
+
+    def left_out(self, sight: Sight) -> list[str]:
+        from magshell_fenicsx.parts.pressure.openings import no_potential  # the solver takes long to import
+
+        open_at = sight.model.without_potential if sight.loads.pressure else ()
+        return [no_potential(open_at)] if open_at else []
 
 
 def account(context: Context, loads: "Loads") -> Account:

@@ -10,7 +10,8 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
-from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.parts.part import Ability, Context, Offer
+from magshell_fenicsx.shape.sections import ShellSection
 from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, nothing, tilted
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def _condition(value: Any) -> Any:
     raise ValueError(f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these")
 
 
-class BoundarySection(Ability):
+class BoundarySection(Section, Ability):
     """Edge, point or patch of a mesh -> condition; edges that are not named are free.
 
     clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: the edge
@@ -61,6 +62,20 @@ class BoundarySection(Ability):
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
         """Name -> condition."""
         return dict(self.__pydantic_extra__ or {})
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that the names of points are free, and that a geometry has the edges that are named."""
+        refuse_taken(context.points)
+        shell = context.shell
+        edges = EDGES[shell.geometry] if isinstance(shell, ShellSection) else ()
+        for name in self.conditions() if edges else ():
+            if name not in edges and name not in context.points:
+                raise ValueError(f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}")
+
+    def withdraws(self, context: Context) -> dict[Offer, str]:
+        """With an edge in a mirror plane the case is a part of a shape."""
+        part = "symmetry" in self.conditions().values()
+        return {"the whole shell": "with boundary: symmetry the case is a part of it alone"} if part else {}
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """A half does not see rigid motions across its plane: it needs a support against all."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.input.section import Finite, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
-Lengths = Annotated[list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(
-    min_length=3, max_length=3
-)]  # fmt: skip
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 UNHELD = ("free", "symmetry")
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import STRAIGHT
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.parts.pressure.openings import ring_openings
-from magshell_fenicsx.parts.supports.supports import RIGHT, STRAIGHT, no_mirror
+from magshell_fenicsx.parts.supports.supports import RIGHT, no_mirror
 
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
@@ -99,12 +99,6 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
             named[name] = here, both
     parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found]
     return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
-
-
-def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
-    """The ends that are not held, and those of them where a live pressure has no potential."""
-    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
-    return ring_openings(places, conditions)
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:

@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.mirror import STRAIGHT, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.parts.loads import Loads
@@ -26,7 +26,6 @@ from magshell_fenicsx.parts.supports.moved import Support
 Array = NDArray[np.float64]
 ALL = (0, 1, 2)
 ROUNDING = 1e-9
-STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
 BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding

@@ -1,13 +1,13 @@
 """The contacts of a model: its cells on all ranks, and the points of their quadrature."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import basix
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.connected import CellsOfAll, whole
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE
@@ -46,24 +46,17 @@ def touchings(
         return []
     V = r0.function_space
     domain, comm, index, element = V.mesh, V.mesh.comm, V.dofmap.index_map, V.element.basix_element
-    topology = domain.topology
-    count = topology.index_map(2).size_local
+    topology, cells_of_all = domain.topology, CellsOfAll.of(V)
+    count, first = len(cells_of_all.own), cells_of_all.own.start
     for dims in ((2, 0), (0, 2)):
         topology.create_connectivity(*dims)
 
-    def gathered(own: NDArray[Any]) -> NDArray[Any]:
-        return np.concatenate(comm.allgather(own))
-
-    def of_nodes(f: fem.Function) -> Array:
-        return np.asarray(gathered(f.x.array[: 3 * index.size_local])).reshape(-1, 3)
-
-    nodes = index.local_to_global(V.dofmap.list[:count].ravel().astype(np.int32)).reshape(count, -1)
+    nodes = cells_of_all.nodes[first : first + count]
     corners = topology.index_map(0).local_to_global(topology.connectivity(2, 0).array[: 3 * count].astype(np.int32))
-    cells = Cells(element, gathered(nodes), gathered(corners.reshape(-1, 3)))
-    first = sum(comm.allgather(count)[: comm.rank])
+    cells = Cells(element, cells_of_all.nodes, cells_of_all.gathered(corners.reshape(-1, 3)))
     X, weights = basix.make_quadrature(basix.CellType.triangle, degree)
     table = element.tabulate(1, X)[..., 0]
-    placed = of_nodes(r0)
+    placed = whole(r0)
     a1, a2 = np.einsum("dqk,nki->dnqi", table[1:], placed[nodes])
     points = Points(
         np.repeat(first + np.arange(count), len(X)),
@@ -72,7 +65,7 @@ def touchings(
         first,
         count + topology.index_map(2).num_ghosts,
     )
-    named = {name: gathered(inside[:count]) for name, inside in patches.items()}
+    named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     made = list[Touching]()
     for pair in pairs:
@@ -92,7 +85,7 @@ def touchings(
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         own = 3 * index.local_range[0], 3 * index.size_local
-        touching = Touching(pair, cells, points, allowed, h, placed, lambda: of_nodes(u), own, comm)
+        touching = Touching(pair, cells, points, allowed, h, placed, lambda: whole(u), own, comm)
         deep, place = touching.deepest()
         if deep > WITHIN * h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)

@@ -1,19 +1,19 @@
 """The key `contact`: which shells may touch, and what a case with it can be."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.parameters import Material
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
     from magshell_fenicsx.parts.touching.touching import Pair
+    from magshell_fenicsx.shape.outline import Outline
 
 WHOLE = "shell"
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
@@ -23,18 +23,29 @@ Pairs = Annotated[
 ]
 
 
-def pairs(given: Sequence[Sequence[str]], material: "Material") -> "tuple[Pair, ...]":
+class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
+    """All pairs of a case that may touch."""
+
+    key = "contact"
+
+    def refuse_unfit(self, context: Context) -> None:
+        refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
+        return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)]
+
+    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        return {"pairs": pairs(self.given, context.shell.poisson_ratio)}
+
+
+def pairs(given: Sequence[Sequence[str]], nu: float) -> "tuple[Pair, ...]":
     """What a case's pairs are in a model."""
     from magshell_fenicsx.parts.touching.touching import Pair  # the solver takes long to import
 
-    k = STIFF / (12 * (1 - material.nu**2))
+    k = STIFF / (12 * (1 - nu**2))
     several = len(given) > 1
     return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
-
-
-def leaves(given: Sequence[Sequence[str]]) -> list[Leaves]:
-    """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
-    return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)] if given else []
 
 
 def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str) -> None:
@@ -45,8 +56,6 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     ValueError
         With the key and what is allowed.
     """
-    if not given:
-        return
     seen = set[frozenset[str]]()
     for i, pair in enumerate(given):
         if frozenset(pair) in seen:
@@ -57,12 +66,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
-    if context.solid:
-        raise ValueError("contact: is of shells: take model: shell")
-    if context.shell.thickness_factor is not None:
-        raise ValueError("contact: needs the same thickness everywhere: leave out shell.thickness_factor")
-    if context.shell.law != "koiter":
-        raise ValueError(f"contact: with shell.law: {context.shell.law}, which makes the shell thinner, is not built")
+    context.needs("contact", "a mid-surface", "the same thickness everywhere", "a thickness that does not change")
     if symmetry in ("half", "axisymmetric"):
         raise ValueError(
             f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "

@@ -21,7 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
-from magshell_fenicsx.parts.bodies.contact import SOFT, penalty
+from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BULGE,

@@ -44,7 +44,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import rigid, touching
+from magshell_fenicsx.simulate.touch import pressing, rigid
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
@@ -183,7 +183,7 @@ def adjoints_of_vibrations(
         If the mode leaves the symmetry of the model, or a body touches the shell.
     """
     state = rigid(scene, scene.model.system.placed(record.point.state))
-    if bodies := touching(scene, state):
+    if bodies := pressing(scene, state):
         raise CaseError(
             f"{of}: has no gradient where a body touches the shell ({bodies[0].body}): where it touches changes within "
             "far less than a difference takes; take differences of runs"

@@ -23,7 +23,7 @@ BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentatio
     ("file", "setting", "said"),
     [
         (BUCKLING, "model=shel", "model: 'shel'"),
-        (BUCKLING, "magnetic.energy=torque", "the expansions are of a shell; a solid has the full energy"),
+        (BUCKLING, "magnetic.energy=torque", "magnetic.energy: torque: needs a mid-surface; or give energy: full"),
         (BUCKLING, "mesh.degree=4", "mesh.degree: not of a solid"),
         (BUCKLING, "mesh.degree=4", "mesh.refinement makes it finer"),
         (CASES / "bracket.yaml", "model=solid", "mesh.degree: not of a solid, which has degree 2; a file with smaller"),

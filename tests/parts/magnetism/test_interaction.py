@@ -299,7 +299,7 @@ WRONG = [
     ({"remanent": REMANENT, "energy": "first", "applied": REMANENT}, {}, "not with energy: first"),
     ({"remanent": {"polar": 0}, "lambda_m": 1e-3}, {}, "how strong it is follows from remanent.flux_density"),
     ({"remanent": REMANENT}, {"loading": [{"kind": "pressure"}]}, "no step of the programme drives it"),
-    ({"remanent": REMANENT}, {"model": "solid"}, "geometry: mesh|is of shells, not of a solid"),
+    ({"remanent": REMANENT}, {"model": "solid"}, "geometry: mesh|needs a mid-surface"),
     ({"remanent": REMANENT}, {}, "the shell is one part"),
 ]
 

@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.parts.magnetism.sources.source import (
     Current,
+    FieldOfSource,
     Harmonic,
-    OwnField,
     Position,
     Size,
     SourceSection,
@@ -42,12 +42,12 @@ class CoilSection(SourceSection):
             raise ValueError("vertices: two of them in a row are the same place")
         return self
 
-    def field(self, key: str, R: float) -> OwnField:
+    def field(self, key: str, R: float) -> FieldOfSource:
         current, currents = self.turns * self.current, magpylib(key).current
         if self.vertices is not None:
             corners = np.array(self.vertices)
             wire = currents.Polyline(current=current, vertices=corners)
-            return OwnField(Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], NOWHERE)
+            return FieldOfSource(Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], NOWHERE)
         assert self.diameter
         r = self.diameter / 2
         loop = currents.Circle(current=current, diameter=2 * r)
@@ -55,7 +55,7 @@ class CoilSection(SourceSection):
         def distance(x: Array) -> Array:
             return np.hypot(np.hypot(x[:, 0], x[:, 1]) - r, x[:, 2])
 
-        return OwnField(Harmonic(loop.getB, distance), [circle(r)], NOWHERE)
+        return FieldOfSource(Harmonic(loop.getB, distance), [circle(r)], NOWHERE)
 
 
 def to_polygon(x: Array, corners: Array) -> Array:

@@ -13,7 +13,7 @@ from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
-from magshell_fenicsx.parts.magnetism.sources.source import Array, Placed
+from magshell_fenicsx.parts.magnetism.sources.source import Array, PlacedSource
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 
@@ -47,7 +47,7 @@ class Sum:
         return B, G, H
 
 
-def placed(context: Context, turn: float = 0.0) -> list[Placed]:
+def placed(context: Context, turn: float = 0.0) -> list[PlacedSource]:
     """The sources of a case, in a frame turned about e3 (rad).
 
     Raises
@@ -60,12 +60,12 @@ def placed(context: Context, turn: float = 0.0) -> list[Placed]:
         return []
     R, unit, Q = context.shell.reference, applied.reference, rotation(turn)
     assert unit
-    sources = list[Placed]()
+    sources = list[PlacedSource]()
     for i, section in enumerate(applied.sources):
         key = f"magnetic.applied.sources.{i}"
         position = [x / R for x in section.position]
         own = section.field(key, R)
-        sources.append(Placed(own, Q @ position, Q @ section.axes, R, section.strength / unit, key))
+        sources.append(PlacedSource(own, Q @ position, Q @ section.axes, R, section.strength / unit, key))
     return sources
 
 
@@ -127,7 +127,7 @@ def _driven(
     applied: AppliedSection,
     steps: Sequence[ProgrammeStep],
     number: int,
-    source: Placed,
+    source: PlacedSource,
     rotations: Sequence[Motion],
     Q: Array,
 ) -> Driven:

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.expressions import Formula, FormulasInSpace, with_derivatives
 from magshell_fenicsx.input.section import FluxDensity
-from magshell_fenicsx.parts.magnetism.sources.source import Array, OwnField, SourceSection
+from magshell_fenicsx.parts.magnetism.sources.source import Array, FieldOfSource, SourceSection
 
 
 class FormulaSource(SourceSection):
@@ -22,11 +22,11 @@ class FormulaSource(SourceSection):
     def words(self) -> str:
         return f"formulas ({', '.join(self.components)})"
 
-    def field(self, key: str, R: float) -> OwnField:
+    def field(self, key: str, R: float) -> FieldOfSource:
         formulas = FormulasInSpace([with_derivatives(text) for text in self.components], np.eye(3))
 
         def values(x: Array) -> tuple[Array, Array, Array]:
             B, G, H = formulas(np.asarray(x / R))
             return self.flux_density * B, self.flux_density / R * G, self.flux_density / R**2 * H
 
-        return OwnField(values, [], "where there is no finite value or derivative of")
+        return FieldOfSource(values, [], "where there is no finite value or derivative of")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
-from magshell_fenicsx.parts.magnetism.sources.source import Array, OwnField, SourceSection
+from magshell_fenicsx.parts.magnetism.sources.source import Array, FieldOfSource, SourceSection
 from magshell_fenicsx.platform.reading import Files, vtk_data
 from magshell_fenicsx.shape.ground import edges
 
@@ -39,7 +39,7 @@ class GridSection(FileKeys, SourceSection):
     def words(self) -> str:
         return f"grid of {self.file}"
 
-    def field(self, key: str, R: float) -> OwnField:
+    def field(self, key: str, R: float) -> FieldOfSource:
         """See `SourceSection`.
 
         Raises
@@ -64,7 +64,7 @@ class GridSection(FileKeys, SourceSection):
             return B, G, H
 
         low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
-        return OwnField(values, edges(low, high), "beyond the grid of")
+        return FieldOfSource(values, edges(low, high), "beyond the grid of")
 
 
 def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":

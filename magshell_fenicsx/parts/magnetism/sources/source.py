@@ -32,7 +32,7 @@ STEP, DEGREE = 0.005, 5  # see `Harmonic`
 
 
 @dataclass(frozen=True)
-class OwnField:
+class FieldOfSource:
     """The field of a source in its own axes.
 
     Attributes
@@ -82,7 +82,7 @@ class SourceSection(Section):
         """Its words in the account of what is built."""
         return f"{self.kind} at ({', '.join(f'{1e3 * x:g}' for x in self.position)}) mm"
 
-    def field(self, key: str, R: float) -> OwnField:
+    def field(self, key: str, R: float) -> FieldOfSource:
         """Its field; `key` is its own, and R (m) what formulas of the place are over.
 
         Raises
@@ -123,10 +123,10 @@ class MagnetSection(SourceSection):
     def solid(self) -> Solid:
         """Its faces, in m."""
 
-    def field(self, key: str, R: float) -> OwnField:
+    def field(self, key: str, R: float) -> FieldOfSource:
         values = Harmonic(self.values(magpylib(key).magnet), self.distance)
         solid = self.solid().magnetised(self.strength * self.vector, self.name or f"{self.kind} magnet")
-        return OwnField(values, self.lines(), "inside", solid)
+        return FieldOfSource(values, self.lines(), "inside", solid)
 
 
 def to_box(beyond: Array) -> Array:
@@ -135,7 +135,7 @@ def to_box(beyond: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedSource:
     """A source at its place as a `FieldInSpace`: lengths over R, B over |B^a|.
 
     Attributes
@@ -152,7 +152,7 @@ class Placed:
         Of the case file.
     """
 
-    own: OwnField
+    own: FieldOfSource
     position: Array
     axes: Array
     length: float

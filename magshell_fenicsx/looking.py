@@ -1,0 +1,173 @@
+"""Commands that solve nothing: pictures and the report of a run, what a case means, examples, the schema, versions."""
+
+from pathlib import Path
+from typing import Annotated
+
+from magshell_fenicsx.command import (
+    CaseFile,
+    Run,
+    Runs,
+    Settings,
+    exit_codes,
+    left_to_the_shell,
+    picture_options,
+    points_of,
+    print_line,
+    refuse_lost,
+    typer,
+    world,
+)
+
+app = typer.Typer()
+
+
+@app.command()
+def plot(
+    folders: Runs,
+    point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
+    animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
+    shapes: Annotated[str | None, typer.Option(metavar="N,N", help="put these points' shells on the curve")] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")] = False,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")] = Path(
+        "curves.png"
+    ),
+    formats: Annotated[
+        str | None, typer.Option(metavar="KIND,KIND", help="besides png: svg, pdf, with text as text")
+    ] = None,
+    width: Annotated[float | None, typer.Option(metavar="MM", help="of a picture")] = None,
+    dpi: Annotated[int | None, typer.Option(help="pixels per inch")] = None,
+    font_size: Annotated[float | None, typer.Option(metavar="POINTS", help="of all text")] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="POLAR,AZIMUTH", help="from the shell to the eye, degrees from e3 and e1")
+    ] = None,
+    range_: Annotated[
+        list[str] | None, typer.Option("--range", metavar="FIELD=LOW:HIGH", help="of colours, as w_over_h=-2:2; repeat")
+    ] = None,
+) -> None:
+    """Draw the pictures and write the report of a run again, from its folder; of several runs their curves in one."""
+    from magshell_fenicsx.output.pictures.plot import plotted
+
+    if world().rank:
+        return
+    with exit_codes(stopped=(OSError,)):
+        options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
+        alone = {"point": point, "animation": animation, "shapes": points_of(shapes), "whole": whole}
+        print_line(plotted(folders, out, options, **alone))
+
+
+@app.command()
+def view(folder: Run) -> None:
+    """Open the report of a run in the web browser: the shell to turn, the path to walk along; else print its path."""
+    from magshell_fenicsx.output.report.report import opened, report_of
+
+    if world().rank:
+        return
+    with exit_codes(stopped=(OSError,)):
+        file = report_of(folder)
+    print_line(f"{'opened' if opened(file) else 'no web browser found; the report is'} {file}")
+
+
+@app.command()
+def check(case: CaseFile, set_: Settings = None) -> None:
+    """Validate a case; print what would be built and what is left out."""
+    from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.case.check import describe
+    from magshell_fenicsx.case.opened import read_together, with_same_files
+    from magshell_fenicsx.input.source import CaseError
+    from magshell_fenicsx.public import problem_of
+    from magshell_fenicsx.simulate.perfect import with_modes
+
+    with exit_codes():
+        source = read_together(case, world(), set_ or [])
+        read = with_same_files(Case.from_source(source), world())
+        problem = with_modes(problem_of(read, world()), world())
+        print_line(describe(read, problem))
+        if read.gradients or read.design:
+            from magshell_fenicsx.simulate.gradients.results import refuse_unknown_results
+
+            try:
+                refuse_unknown_results(problem, read.design.named if read.design else {})
+            except CaseError as e:
+                raise CaseError(read.placed(str(e))) from None
+        if read.ensemble:
+            from magshell_fenicsx.studies.samples import refuse_unknown_keys
+
+            refuse_unknown_keys(source, read.ensemble, Case.from_source)
+        if read.design:
+            from magshell_fenicsx.studies.design_variables import refuse_unfit_numbers
+
+            try:
+                refuse_unfit_numbers(source, read, read.design)
+            except CaseError as e:
+                raise CaseError(read.placed(str(e))) from None
+    refuse_lost()
+
+
+def _names() -> list[str]:
+    from magshell_fenicsx.case.examples import examples
+
+    return list(examples())
+
+
+@app.command()
+def example(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="name of the example", autocompletion=_names)
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE.yaml", help="file to write; default NAME.yaml", autocompletion=left_to_the_shell),
+    ] = None,
+) -> None:
+    """Write an example case to a file; without NAME, list all examples."""
+    from magshell_fenicsx.case.examples import examples, title, write_example
+
+    if name is None:
+        for known, where in examples().items():
+            print_line(f"{known:24} {title(where)}")
+        refuse_lost()
+        return
+    if world().rank:
+        return
+    with exit_codes():
+        written = write_example(name, file)
+    print_line(f"wrote {', '.join(map(str, written))}")
+
+
+@app.command()
+def schema(
+    markdown: Annotated[bool, typer.Option("--markdown", help="print the page docs/case.md instead")] = False,
+) -> None:
+    """Print the JSON Schema of the case file, for editors."""
+    from magshell_fenicsx.case.reference import reference, schema_text
+
+    print_line((reference() if markdown else schema_text()).removesuffix("\n"))
+    refuse_lost()
+
+
+@app.command()
+def info(
+    compile_: Annotated[bool, typer.Option("--compile", help="compile the kernels of degrees 3 and 4 now")] = False,
+) -> None:
+    """Print versions, the BLAS in use and the folder of the kernel cache."""
+    from magshell_fenicsx.platform.environment import fast_blas, versions
+    from magshell_fenicsx.platform.kept import kernel_cache
+    from magshell_fenicsx.simulate.precompile import precompile
+
+    with exit_codes():
+        kernels = kernel_cache()
+    for name, number in versions().items():
+        print_line(f"{name:18} {number}")
+    print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
+    print_line(f"{'ranks':18} {world().size}")
+    print_line(f"{'kernel cache':18} {kernels}")
+    if compile_:
+        from magshell_fenicsx.case.case import Case
+        from magshell_fenicsx.output.pictures.view import library
+
+        if not world().rank:
+            library()
+        for degree in (3, 4):
+            seconds = precompile(degree, lambda source: Case.from_source(source).problem())
+            print_line(f"compiled degree {degree} in {seconds:.1f} s")
+    refuse_lost()

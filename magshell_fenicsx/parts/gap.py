@@ -1,0 +1,82 @@
+"""What touches a shell's faces: the penalty of a penetration, and how far the faces are from the mid-surface.
+
+A shell that keeps its volume gets thinner as its surface stretches; a natural shape is what has grown without stress,
+and its volume stays.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.following import Follows
+from magshell_fenicsx.models.carriers import Carrier
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Forms, Jet
+
+Array = NDArray[np.float64]
+SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
+ROUNDING = 1e-5  # of the soft penetration: a smaller change of it is no divisor
+Thinning = Callable[[Array], Follows[Array]]  # from places in the reference cell to values there, (cells * places,)
+
+
+class Grown(Protocol):
+    """A natural shape."""
+
+    @property
+    def values(self) -> tuple[Array, ...] | None:
+        """On which its volume depends; None if that is the undeformed one."""
+        ...
+
+    def volume(self, first: Array, points: Array) -> Array:
+        """Over the undeformed one (cells, places), where the surface has these tangents (2, cells, places, 3)."""
+        ...
+
+
+def thinned(r0: Jet, u: Jet, natural: Forms | None = None) -> Expr:
+    """The deformed thickness over the undeformed one: undeformed, or natural, over deformed area."""
+    stretch = kin.area_ratio(r0) / kin.area_ratio(r0 + u)
+    return stretch if natural is None else stretch * natural.area * natural.thickness
+
+
+def thinning(carrier: Carrier, u: fem.Function, natural: Grown | None) -> Thinning:
+    """The same at points, at the present displacement and natural shape."""
+    r0, V = carrier.r0, u.function_space
+    by = natural.values if natural else None
+
+    def at(points: Array) -> Follows[Array]:
+        jets_of = carrier.tables(V, points)
+
+        def values() -> Array:
+            first = jets_of(r0.x.array)[1:3]
+            area0, area = (np.linalg.norm(np.cross(*a), axis=-1) for a in (first, first + jets_of(u.x.array)[1:3]))
+            factor = natural.volume(first, points) if natural and by else 1.0
+            return np.asarray(factor * area0 / area).ravel()
+
+        return Follows(values, lambda: (r0.x.array, u.x.array, *(by or ())))
+
+    return at
+
+
+def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
+    """psi of a penetration s with two derivatives: psi'' grows from 0 to k over `soft`, and is continuous."""
+    t = np.maximum(s, 0.0)
+    full = t > soft
+    second = np.where(full, k, k * t / soft)
+    first = np.where(full, k * (t - soft / 2), k * t**2 / (2 * soft))
+    value = np.where(full, k * (t**2 / 2 - t * soft / 2 + soft**2 / 6), k * t**3 / (6 * soft))
+    return value, first, second
+
+
+def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:
+    """(psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1."""
+    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft), penalty(s1, k, soft)
+    _, middle, stiff = penalty((s0 + s1) / 2, k, soft)
+    simpson, slope = (p0 + 4 * middle + p1) / 6, (2 * stiff + k1) / 6  # exact where psi'' has no kink between
+    across = (np.digitize(s0, (0.0, soft)) != np.digitize(s1, (0.0, soft))) & (np.abs(s1 - s0) > ROUNDING * soft)
+    ds = np.where(across, s1 - s0, 1.0)
+    mean = np.where(across, (v1 - v0) / ds, simpson)
+    return mean, np.where(across, (p1 - mean) / ds, slope)
