@@ -427,6 +427,13 @@ def check(case: CaseFile, set_: Settings = None) -> None:
                 refuse_unfit_numbers(source, read, read.design)
             except CaseError as e:
                 raise CaseError(read.placed(str(e))) from None
+        if read.identify:
+            from magshell_fenicsx.studies.identify_data import refuse_unfit_section
+
+            try:
+                refuse_unfit_section(source, read, read.identify)
+            except CaseError as e:
+                raise CaseError(read.placed(str(e))) from None
     refuse_lost()
 
 

@@ -33,7 +33,7 @@ from magshell_fenicsx.studies.design_blocks import Number
 from magshell_fenicsx.studies.identify_data import Names, Parameter, Table, candidate, parameters_of, table_of
 from magshell_fenicsx.studies.identify_picture import draw_identified
 from magshell_fenicsx.studies.identify_sections import IdentifySection
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
 from magshell_fenicsx.studies.points import identity, short
 from magshell_fenicsx.studies.runner import Folder, Made, Say, keep, kept
 
@@ -226,10 +226,14 @@ def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
     for number, column in enumerate(table.columns):
         count = int((table.column == number).sum())
         if np.isnan(column.noise) and count <= len(bare):
-            raise CaseError(
-                f"identify.noise: {column.header}: {count} data do not say the noise beside {len(bare)} parameters: "
-                "give it"
-            )
+            raise _no_noise(table, number, len(bare))
+
+
+def _no_noise(table: Table, column: int, parameters: int) -> CaseError:
+    header, count = table.columns[column].header, int((table.column == column).sum())
+    return CaseError(
+        f"identify.noise: {header}: {count} data do not say the noise beside {parameters} parameters: give it"
+    )
 
 
 def _identified(
@@ -268,6 +272,8 @@ def _identified(
         raise CaseError(
             f"identify.parameters: {' and '.join(alike)} cannot be told apart by these data: give one of them a prior"
         ) from None
+    except NoNoise as e:
+        raise _no_noise(table, e.column, len(parameters)) from None
     bent, lost = nonlinearity(partial(model, slopes=False), known, fit)
     content = _content(predictor, section, table, known, fit)
     content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
@@ -298,12 +304,14 @@ def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence
 def _content(predictor: Predictor, section: IdentifySection, table: Table, known: Measured, fit: Fit) -> dict[str, Any]:
     """What is found, as plain data."""
     low, high = fit.band
+    far = fit.quantiles(np.eye(len(fit.x)))
     found = {
         p.key: {
             "value": float(fit.x[i]),
             "deviation": float(fit.deviation[i]),
             "low": float(low[i]),
             "high": float(high[i]),
+            "quantile": float(far[i]),
             "unit": p.unit,
             "start": p.start,
             "prior": None if np.isinf(p.deviation) else {"mean": p.mean, "deviation": p.deviation},
@@ -311,6 +319,8 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
         for i, p in enumerate(predictor.parameters)
     }
     spread, s = fit.spread(fit.slopes), fit.noise[table.column]
+    half = fit.quantiles(fit.slopes) * spread
+    half_measured = fit.quantiles(fit.slopes, table.column) * np.hypot(spread, s)
     listed = [(settings, each) for settings, of in table.readings.items() for each in of]
     rows = [
         {
@@ -319,11 +329,11 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
             "at": "end" if each.at is None else each.at,
             "measured": float(table.data[i]),
             "predicted": float(fit.y[i]),
-            "low": float(fit.y[i] - fit.quantile * spread[i]),
-            "high": float(fit.y[i] + fit.quantile * spread[i]),
+            "low": float(fit.y[i] - half[i]),
+            "high": float(fit.y[i] + half[i]),
             "noise": float(s[i]),
-            "low_measured": float(fit.y[i] - fit.quantile * np.hypot(spread[i], s[i])),
-            "high_measured": float(fit.y[i] + fit.quantile * np.hypot(spread[i], s[i])),
+            "low_measured": float(fit.y[i] - half_measured[i]),
+            "high_measured": float(fit.y[i] + half_measured[i]),
         }
         for i, (settings, each) in enumerate(listed)
     ]
@@ -343,7 +353,6 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
         "noise": noise,
         "places": table.places,
         "misfit_over_noise": float(np.sqrt(np.mean(((known.data - fit.y) / s) ** 2))),
-        "quantile": fit.quantile,
         "steps": fit.steps,
         "ended": fit.ended,
         "rows": rows,
@@ -380,9 +389,9 @@ def _others(
             found.append({**row, "note": seen.note})
             continue
         slope = np.array(seen.slopes[0])
-        value, spread = seen.values[0], float(fit.spread(slope[None])[0])
+        value, half = seen.values[0], float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0])
         narrowed = {key: float(v) for key, v in zip(keys, fit.narrowed(slope, noise), strict=True)}
-        low, high = value - fit.quantile * spread, value + fit.quantile * spread
+        low, high = value - half, value + half
         found.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
     there = [each for each in found if "value" in each]
     if not there:
@@ -418,7 +427,7 @@ def _sentences(content: dict[str, Any], fit: Fit, known: Measured, table: Table)
     if bent > NORMAL or lost:
         nowhere = f", and at {lost} such places nothing is predicted" if lost else ""
         said.append(
-            f"warning: two deviations away the misfit differs by {100 * bent:.0f} % from its parabola{nowhere}: "
+            f"warning: at the ends of the bands the misfit differs by {100 * bent:.0f} % from its parabola{nowhere}: "
             "the bands are rough"
         )
     if content["ended"] != "converged":
