@@ -4,6 +4,7 @@ What is there is executed. So it is only taken from folders and files that the u
 change; where the usual folder is none, a private one takes its place.
 """
 
+import fcntl
 import grp
 import os
 import pwd
@@ -11,12 +12,13 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 FORMS = "libffcx_forms_"  # how the names of dolfinx's begin
-UNFINISHED = 600  # s after which nobody compiles any more
+COMPILING = "magshell_compiling.lock"  # held together by all who compile
+UNFINISHED = 600  # s after which nobody compiles any more, while somebody compiles something
 
 
 class UnsafeCache(RuntimeError):
@@ -71,6 +73,18 @@ def keep(name: str, content: bytes) -> None:
         return
 
 
+@contextmanager
+def compiling(folder: Path) -> Iterator[None]:
+    """While forms are compiled into a folder; where files cannot be locked, go on.
+
+    The lock ends with the process: what is unfinished while nobody has it was left by one that was killed.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError):
+            fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_SH)
+        yield
+
+
 def _usual() -> Path:
     from dolfinx.jit import get_options  # takes long to import
 
@@ -106,16 +120,19 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     """
     there = sorted(folder.glob(f"{FORMS}*"))
     strange = {file.name.split(".")[0] for file in there if not trusted(file)}
-    with suppress(OSError):
+    names = {file.name for file in there}
+    unfinished = [file for file in there if file.suffix == ".c" and f"{file.name}.cached" not in names]
+    with ExitStack() as stack:
         late = time.time() - UNFINISHED
-        strange |= {
-            file.stem
-            for file in folder.glob(f"{FORMS}*.c")
-            if file.stat().st_mtime < late and not file.with_suffix(".c.cached").exists()
-        }
-    for file in there:
-        if file.name.split(".")[0] in strange:
-            file.unlink(missing_ok=True)
+        with suppress(OSError):
+            if unfinished:
+                fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                late = float("inf")
+        with suppress(OSError):
+            strange |= {file.stem for file in unfinished if file.stat().st_mtime < late}
+        for file in there:
+            if file.name.split(".")[0] in strange:
+                file.unlink(missing_ok=True)
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():
             if trusted(file):
