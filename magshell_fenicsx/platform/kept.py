@@ -42,7 +42,7 @@ def kept_file(name: str) -> Path | None:
     return next((folder / name for folder in folders if trusted(folder / name)), None)
 
 
-def trusted(file: Path) -> bool:
+def trusted(file: "Path | os.DirEntry[str]") -> bool:
     """Whether there is such a file, of the user or root, that nobody else may change."""
     try:
         about = file.stat()
@@ -118,10 +118,10 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
-    there = sorted(folder.glob(f"{FORMS}*"))
-    strange = {file.name.split(".")[0] for file in there if not trusted(file)}
-    names = {file.name for file in there}
-    unfinished = [file for file in there if file.suffix == ".c" and f"{file.name}.cached" not in names]
+    with os.scandir(folder) as files:  # there may be thousands
+        there = {file.name: file for file in files if file.name.startswith(FORMS)}
+    strange = {name.split(".")[0] for name, file in there.items() if not trusted(file)}
+    unfinished = [file for name, file in there.items() if name.endswith(".c") and f"{name}.cached" not in there]
     with ExitStack() as stack:
         late = time.time() - UNFINISHED
         with suppress(OSError):
@@ -129,10 +129,10 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
                 fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_EX | fcntl.LOCK_NB)
                 late = float("inf")
         with suppress(OSError):
-            strange |= {file.stem for file in unfinished if file.stat().st_mtime < late}
-        for file in there:
-            if file.name.split(".")[0] in strange:
-                file.unlink(missing_ok=True)
+            strange |= {file.name.split(".")[0] for file in unfinished if file.stat().st_mtime < late}
+        for name in there if strange else ():
+            if name.split(".")[0] in strange:
+                (folder / name).unlink(missing_ok=True)
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():
             if trusted(file):
