@@ -1,7 +1,9 @@
 """Commands that solve nothing: pictures and the report of a run, what a case means, examples, the schema, versions."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from magshell_fenicsx.command import (
     CaseFile,
@@ -17,6 +19,10 @@ from magshell_fenicsx.command import (
     typer,
     world,
 )
+from magshell_fenicsx.input.source import CaseError
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.case.case import Case
 
 app = typer.Typer()
 
@@ -73,7 +79,6 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.case.check import describe
     from magshell_fenicsx.case.opened import read_together, with_same_files
-    from magshell_fenicsx.input.source import CaseError
     from magshell_fenicsx.public import problem_of
     from magshell_fenicsx.simulate.perfect import with_modes
 
@@ -85,10 +90,8 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         if read.gradients or read.design:
             from magshell_fenicsx.simulate.gradients.results import refuse_unknown_results
 
-            try:
+            with _placed(read):
                 refuse_unknown_results(problem, read.design.named if read.design else {})
-            except CaseError as e:
-                raise CaseError(read.placed(str(e))) from None
         if read.ensemble:
             from magshell_fenicsx.studies.samples import refuse_unknown_keys
 
@@ -96,11 +99,23 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         if read.design:
             from magshell_fenicsx.studies.design_variables import refuse_unfit_numbers
 
-            try:
+            with _placed(read):
                 refuse_unfit_numbers(source, read, read.design)
-            except CaseError as e:
-                raise CaseError(read.placed(str(e))) from None
+        if read.identify:
+            from magshell_fenicsx.studies.identify_data import refuse_unfit_section
+
+            with _placed(read):
+                refuse_unfit_section(source, read, read.identify)
     refuse_lost()
+
+
+@contextmanager
+def _placed(case: "Case") -> Iterator[None]:
+    """Messages of the block get the place of their key in the case file."""
+    try:
+        yield
+    except CaseError as e:
+        raise CaseError(case.placed(str(e))) from None
 
 
 def _names() -> list[str]:

@@ -12,7 +12,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from magshell_fenicsx.platform.compiler import check_room, library
-from magshell_fenicsx.platform.kept import kernel_cache
+from magshell_fenicsx.platform.kept import compiling, kernel_cache
 from magshell_fenicsx.platform.processes import from_first
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
@@ -31,7 +31,8 @@ class KernelLog:
         """Compile a form, or load it from the cache."""
         start, folder = time.perf_counter(), kernel_cache()
         try:
-            form = fem.form(expression, jit_options={**JIT_OPTIONS, "cache_dir": folder})
+            with compiling(folder):
+                form = fem.form(expression, jit_options={**JIT_OPTIONS, "cache_dir": folder})
         except (OSError, cffi.VerificationError):
             check_room(folder)
             raise

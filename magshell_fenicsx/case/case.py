@@ -116,7 +116,7 @@ class Case(WithParts):
     def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
-            parts = {key: data.get(key) for key in ("points", "mesh", "sensors", *PARTS)}
+            parts = {key: data.get(key) for key in ("mesh", *PARTS)} | _places(data)
             written = listed(data.get("loading"))
             for key, load in listed(section.loading).items():
                 if load.measured and isinstance(written[key], dict):
@@ -288,3 +288,10 @@ class Case(WithParts):
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
             raise InvalidCase(e.errors(), source, cls) from None
+
+
+def _places(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The places of plain data by their keys; what they are called has no meaning."""
+    sensors = {name: each for name, each in (data.get("sensors") or {}).items() if isinstance(each, dict)}
+    places = {f"points.{name}": place for name, place in (data.get("points") or {}).items()}
+    return places | {f"sensors.{name}.position": each.get("position") for name, each in sensors.items()}

@@ -64,6 +64,8 @@ def _described(case: Case, problem: Problem) -> str:
         left_out.append(no_potential(open_at))
     if case.ensemble:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
+    if case.identify:
+        left_out.append("identify: numbers that are looked for (magshell identify alone varies them)")
     left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in problem.included), "left out:", *(f"  {item}" for item in left_out)]
     missed: list[str] = []

@@ -29,6 +29,7 @@ FLAT = ("strip", "plate", "mesh")
 NONE = 1e-12  # of the largest stiffness: what is left where plies cancel
 KEPT = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])  # 11, 12, 22, 16, 26, 66
 TWISTING = [3, 4]  # of these
+LEAST, MOST = 1e-9, 1e9  # of a modulus over E
 
 
 class PlySection(Section):
@@ -128,10 +129,28 @@ class LaminateSection(Section):
         return np.where(np.abs(found) <= NONE * sizes, 0.0, found)
 
     def direction(self, geometry: str) -> Array | None:
-        """The vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
+        """The unit vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
-        return np.array([1.0, 0.0, 0.0] if self.along is None else self.along)
+        vector = np.array([1.0, 0.0, 0.0] if self.along is None else self.along)
+        vector = vector / np.abs(vector).max()  # first: squares of tiny and huge numbers are none
+        return np.asarray(vector / np.linalg.norm(vector))
+
+    def refuse_unfit_sizes(self, E: float) -> None:
+        """See that moduli are of sizes that numbers can have beside Young's modulus.
+
+        Raises
+        ------
+        ValueError
+            If one is not.
+        """
+        for i, ply in enumerate(self.plies):
+            for key in ("E1", "E2", "G12"):
+                if not LEAST <= (ratio := getattr(ply, key) / E) <= MOST:
+                    raise ValueError(
+                        f"shell.laminate.plies.{i}.{key}: is {ratio:.4g} times youngs_modulus: allowed {LEAST:g} to "
+                        f"{MOST:g}"
+                    )
 
 
 def laminate_of(shell: Any, turn: float) -> "Laminate | None":
@@ -157,13 +176,14 @@ class Laminated(Ability):
         return cls(context.shell.laminate) if context.shell.laminate else None
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that moduli and youngs_modulus are in one unit, and that a mirror plane mirrors the plies."""
+        """See that moduli and youngs_modulus go together, and that a mirror plane mirrors the plies."""
         section = self.section
         if section.with_units == isnan(given(context.shell).E):
             there = (
                 "have a unit: youngs_modulus has none" if section.with_units else "have none: youngs_modulus has one"
             )
             raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
+        section.refuse_unfit_sizes(context.shell.youngs_modulus or 1.0)
         context.needs("shell.laminate", "a mid-surface")
         if section.twists:
             context.needs(
@@ -179,8 +199,7 @@ class Laminated(Ability):
 
 
 def _leaves(section: LaminateSection, geometry: str) -> Leaves:
-    vector = section.direction(geometry)
-    unit = None if vector is None else vector / np.linalg.norm(vector)
+    unit = section.direction(geometry)
     reason = None
     if section.twists:
         reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"

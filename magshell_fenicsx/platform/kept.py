@@ -4,6 +4,7 @@ What is there is executed. So it is only taken from folders and files that the u
 change; where the usual folder is none, a private one takes its place.
 """
 
+import fcntl
 import grp
 import os
 import pwd
@@ -11,12 +12,13 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 FORMS = "libffcx_forms_"  # how the names of dolfinx's begin
-UNFINISHED = 600  # s after which nobody compiles any more
+COMPILING = "magshell_compiling.lock"  # held together by all who compile
+UNFINISHED = 600  # s after which nobody compiles any more, while somebody compiles something
 
 
 class UnsafeCache(RuntimeError):
@@ -40,16 +42,13 @@ def kept_file(name: str) -> Path | None:
     return next((folder / name for folder in folders if trusted(folder / name)), None)
 
 
-def trusted(file: Path) -> bool:
+def trusted(file: "Path | os.DirEntry[str]") -> bool:
     """Whether there is such a file, of the user or root, that nobody else may change."""
     try:
-        return _is_trusted(file.stat())
+        about = file.stat()
     except OSError:
         return False
-
-
-def _is_trusted(about: os.stat_result | None) -> bool:
-    return about is not None and about.st_uid in (0, os.getuid()) and not _writable_by_others(about)
+    return about.st_uid in (0, os.getuid()) and not _writable_by_others(about)
 
 
 def recall(name: str) -> bytes | None:
@@ -72,6 +71,18 @@ def keep(name: str, content: bytes) -> None:
         Path(new).replace(folder / name)  # whole at every moment: other processes may read it
     except OSError:
         return
+
+
+@contextmanager
+def compiling(folder: Path) -> Iterator[None]:
+    """While forms are compiled into a folder; where files cannot be locked, go on.
+
+    The lock ends with the process: what is unfinished while nobody has it was left by one that was killed.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError):
+            fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_SH)
+        yield
 
 
 def _usual() -> Path:
@@ -107,34 +118,26 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
-    forms, late = _forms(folder), time.time() - UNFINISHED
-    strange = {
-        name.split(".")[0]
-        for name, about in forms.items()
-        if not _is_trusted(about)
-        or (about and name.endswith(".c") and about.st_mtime < late and f"{name}.cached" not in forms)
-    }
-    for name in forms:
-        if name.split(".")[0] in strange:
-            (folder / name).unlink(missing_ok=True)
+    with os.scandir(folder) as files:  # there may be thousands
+        there = {file.name: file for file in files if file.name.startswith(FORMS)}
+    strange = {name.split(".")[0] for name, file in there.items() if not trusted(file)}
+    unfinished = [file for name, file in there.items() if name.endswith(".c") and f"{name}.cached" not in there]
+    with ExitStack() as stack:
+        late = time.time() - UNFINISHED
+        with suppress(OSError):
+            if unfinished:
+                fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                late = float("inf")
+        with suppress(OSError):
+            strange |= {file.name.split(".")[0] for file in unfinished if file.stat().st_mtime < late}
+        for name in there if strange else ():
+            if name.split(".")[0] in strange:
+                (folder / name).unlink(missing_ok=True)
     for other in also:
-        for name, about in _forms(other).items() if other != folder else ():
-            if _is_trusted(about):
+        for file in other.glob(f"{FORMS}*") if other != folder else ():
+            if trusted(file):
                 with suppress(FileExistsError):
-                    (folder / name).symlink_to(other / name)
-
-
-def _forms(folder: Path) -> dict[str, os.stat_result | None]:
-    """The files of dolfinx's forms in a folder, of which there may be thousands; None for a link that leads nowhere."""
-    forms = dict[str, os.stat_result | None]()
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name.startswith(FORMS):
-                try:
-                    forms[entry.name] = entry.stat()
-                except OSError:
-                    forms[entry.name] = None
-    return forms
+                    (folder / file.name).symlink_to(file)
 
 
 def _candidates(usual: Path) -> Iterator[Path]:
@@ -151,7 +154,9 @@ def _is_private(folder: Path) -> bool:
     """Whether nobody but the user and root may change what is in a folder, or put another in its place."""
     folder = folder.resolve()
     about = folder.stat()
-    return _is_trusted(about) and all(_keeps(parent.stat()) for parent in folder.parents)
+    if about.st_uid not in (0, os.getuid()) or _writable_by_others(about):
+        return False
+    return all(_keeps(parent.stat()) for parent in folder.parents)
 
 
 def _keeps(about: os.stat_result) -> bool:

@@ -30,7 +30,7 @@ def second_axis(text: str, first: str) -> Axis:
     Raises
     ------
     CaseError
-        If it is no list of numbers of one other key.
+        If it is no list of numbers of one other key, each once.
     """
     axis = parse_axis(text)
     if len(axis.keys) > 1 or axis.numbers is None or axis.name == first or axis.name.split(".")[0] in BESIDE:
@@ -38,6 +38,9 @@ def second_axis(text: str, first: str) -> Axis:
             f"--over {text}: the second key of a map is another number of the shell or its loads, written as "
             "key.path=first:last:count or key.path=value,value,..."
         )
+    numbers = [axis.number(value) for value in axis.values]
+    if twice := next((value for i, value in enumerate(axis.values) if numbers[i] in numbers[:i]), None):
+        raise CaseError(f"--over {text}: {twice} stands twice: each value of the second key has one boundary")
     return axis
 
 
@@ -89,6 +92,8 @@ def boundary_map(
                 without[value] = str(e)
                 once(f"{axis.name} = {value}: no boundary: {e}")
                 continue
+            except CaseError as e:
+                raise CaseError(str(e).replace(f"--set {own[-1]}", f"--over {own[-1]}")) from None
             lines[value] = found
             rows += [{"second": axis.number(value), "amplitude": found.content["load"], **row} for row in found.rows]
         if not rows:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
@@ -33,7 +32,8 @@ from magshell_fenicsx.studies.design_blocks import Number
 from magshell_fenicsx.studies.identify_data import Names, Parameter, Table, candidate, parameters_of, table_of
 from magshell_fenicsx.studies.identify_picture import draw_identified
 from magshell_fenicsx.studies.identify_sections import IdentifySection
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.identify_words import sentences
+from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
 from magshell_fenicsx.studies.points import identity, short
 from magshell_fenicsx.studies.runner import Folder, Made, Say, keep, kept
 
@@ -42,9 +42,6 @@ FOLDER = Folder(
     "an identification", ("identify.json", "identify.csv", "identify.png"), ("case", "parameters", "predicted")
 )
 NOTHING = 1e-9  # change of a result over that of a parameter, both relative: it has no influence
-ALIKE = 0.95  # correlation from which two parameters are hardly told apart
-PRIOR = 0.9  # part of the prior's deviation above which data say little
-UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 Settings = tuple[str, ...]
 
 
@@ -226,10 +223,14 @@ def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
     for number, column in enumerate(table.columns):
         count = int((table.column == number).sum())
         if np.isnan(column.noise) and count <= len(bare):
-            raise CaseError(
-                f"identify.noise: {column.header}: {count} data do not say the noise beside {len(bare)} parameters: "
-                "give it"
-            )
+            raise _no_noise(table, number, len(bare))
+
+
+def _no_noise(table: Table, column: int, parameters: int) -> CaseError:
+    header, count = table.columns[column].header, int((table.column == column).sum())
+    return CaseError(
+        f"identify.noise: {header}: {count} data do not say the noise beside {parameters} parameters: give it"
+    )
 
 
 def _identified(
@@ -268,12 +269,14 @@ def _identified(
         raise CaseError(
             f"identify.parameters: {' and '.join(alike)} cannot be told apart by these data: give one of them a prior"
         ) from None
+    except NoNoise as e:
+        raise _no_noise(table, e.column, len(parameters)) from None
     bent, lost = nonlinearity(partial(model, slopes=False), known, fit)
     content = _content(predictor, section, table, known, fit)
     content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
     content["predicted"], content["next"] = _others(predictor, section, fit, others)
     content["evaluations"] = predictor.count
-    content["said"] = _sentences(content, fit, known, table)
+    content["said"] = sentences(content, fit, known, table)
     drawn = partial(draw_identified, content, _curves(predictor, table, fit))
     return Identified(content, fit), drawn
 
@@ -298,12 +301,14 @@ def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence
 def _content(predictor: Predictor, section: IdentifySection, table: Table, known: Measured, fit: Fit) -> dict[str, Any]:
     """What is found, as plain data."""
     low, high = fit.band
+    far = fit.quantiles(np.eye(len(fit.x)))
     found = {
         p.key: {
             "value": float(fit.x[i]),
             "deviation": float(fit.deviation[i]),
             "low": float(low[i]),
             "high": float(high[i]),
+            "quantile": float(far[i]),
             "unit": p.unit,
             "start": p.start,
             "prior": None if np.isinf(p.deviation) else {"mean": p.mean, "deviation": p.deviation},
@@ -311,6 +316,8 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
         for i, p in enumerate(predictor.parameters)
     }
     spread, s = fit.spread(fit.slopes), fit.noise[table.column]
+    half = fit.quantiles(fit.slopes) * spread
+    half_measured = fit.quantiles(fit.slopes, table.column) * np.hypot(spread, s)
     listed = [(settings, each) for settings, of in table.readings.items() for each in of]
     rows = [
         {
@@ -319,11 +326,11 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
             "at": "end" if each.at is None else each.at,
             "measured": float(table.data[i]),
             "predicted": float(fit.y[i]),
-            "low": float(fit.y[i] - fit.quantile * spread[i]),
-            "high": float(fit.y[i] + fit.quantile * spread[i]),
+            "low": float(fit.y[i] - half[i]),
+            "high": float(fit.y[i] + half[i]),
             "noise": float(s[i]),
-            "low_measured": float(fit.y[i] - fit.quantile * np.hypot(spread[i], s[i])),
-            "high_measured": float(fit.y[i] + fit.quantile * np.hypot(spread[i], s[i])),
+            "low_measured": float(fit.y[i] - half_measured[i]),
+            "high_measured": float(fit.y[i] + half_measured[i]),
         }
         for i, (settings, each) in enumerate(listed)
     ]
@@ -343,7 +350,6 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
         "noise": noise,
         "places": table.places,
         "misfit_over_noise": float(np.sqrt(np.mean(((known.data - fit.y) / s) ** 2))),
-        "quantile": fit.quantile,
         "steps": fit.steps,
         "ended": fit.ended,
         "rows": rows,
@@ -380,9 +386,9 @@ def _others(
             found.append({**row, "note": seen.note})
             continue
         slope = np.array(seen.slopes[0])
-        value, spread = seen.values[0], float(fit.spread(slope[None])[0])
+        value, half = seen.values[0], float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0])
         narrowed = {key: float(v) for key, v in zip(keys, fit.narrowed(slope, noise), strict=True)}
-        low, high = value - fit.quantile * spread, value + fit.quantile * spread
+        low, high = value - half, value + half
         found.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
     there = [each for each in found if "value" in each]
     if not there:
@@ -391,54 +397,6 @@ def _others(
     then = best["deviations_then"][keys[chosen]]
     how = {"parameter": keys[chosen], "from": float(fit.deviation[chosen]), "to": then}
     return found, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
-
-
-def _sentences(content: dict[str, Any], fit: Fit, known: Measured, table: Table) -> list[str]:
-    """What is found, in words."""
-    said, keys = list[str](), list(content["parameters"])
-    for key, each in content["parameters"].items():
-        unit = f" {each['unit']}" if each["unit"] else ""
-        said.append(f"{key} = {each['value']:.6g}{unit}, 95 % between {each['low']:.6g} and {each['high']:.6g}{unit}")
-        if each["prior"] and each["deviation"] > PRIOR * each["prior"]["deviation"]:
-            said.append(f"{key}: the data add little to its prior")
-    for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
-        if abs(c := float(fit.correlation[i, j])) > ALIKE:
-            said.append(f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation {c:+.4f}")
-    for header, each in content["noise"].items():
-        how = "estimated" if each["estimated"] else "given"
-        said.append(f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}")
-    if not np.isnan(known.noise).any():
-        square = float((((known.data - fit.y) / fit.noise[table.column]) ** 2).sum())
-        if scipy.stats.chi2.sf(square, max(len(known.data), 1)) < UNLIKELY:
-            said.append(
-                f"warning: the misfit is {content['misfit_over_noise']:.3g} times the noise: the model does not "
-                "describe these data, or their noise is larger; leave it out to have it estimated"
-            )
-    bent, lost = content["normal"]["difference"], content["normal"]["lost"]
-    if bent > NORMAL or lost:
-        nowhere = f", and at {lost} such places nothing is predicted" if lost else ""
-        said.append(
-            f"warning: two deviations away the misfit differs by {100 * bent:.0f} % from its parabola{nowhere}: "
-            "the bands are rough"
-        )
-    if content["ended"] != "converged":
-        said.append(f"warning: the fit has not converged: {content['ended']}")
-    for each in content["predicted"]:
-        place = f" at {each['at']:g}" if each["at"] != "end" else ""
-        if "note" in each:
-            said.append(f"{each['result']}{place}: is not predicted: {each['note']}")
-            continue
-        said.append(
-            f"{each['result']}{place} = {each['value']:.6g} {each['unit']}".rstrip()
-            + f" predicted, 95 % between {each['low']:.6g} and {each['high']:.6g}"
-        )
-    if best := content["next"]:
-        place = "" if best["at"] == "end" else f" at {best['at']:g}"
-        said.append(
-            f"next: {best['result']}{place} narrows {best['parameter']} most: "
-            f"deviation {best['from']:.3g} -> {best['to']:.3g}"
-        )
-    return said
 
 
 def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tuple[float, float]]]:

@@ -146,6 +146,19 @@ class Names:
         own = [self.places.bare] if self.places else []
         return [*own, *(name for name in differentiable(scene, scene.unloaded()) if name not in own)]
 
+    def refuse_strange(self, name: str, where: str) -> None:
+        """See that a column of data may have a name, with or without its unit.
+
+        Raises
+        ------
+        CaseError
+            If no result has it.
+        """
+        units = [q.name for of in self._bare if (q := self.scene.sizes.column(of))]
+        names = [*self._bare, *units, *FOLDS, *(of.rpartition("_")[0] for of in FOLDS if of in SCALES)]
+        if name not in names and not NAMES.fullmatch(name):
+            raise CaseError(f"{where}: {name}: the case has no such result; allowed are {', '.join(names)}")
+
     def amount(self, amount: Amount, of: str, where: str) -> float:
         """A number for a result, in its unit of the case.
 
@@ -291,6 +304,23 @@ def _listed(
         raise CaseError(f"{where}: {places}: has a row without a number")
     numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
     return Table(tuple(own for own, _ in results), readings, flat, numbers, places)
+
+
+def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:
+    """See what can be seen of a section without data: that parameters are numbers and that results are there.
+
+    Raises
+    ------
+    CaseError
+        With the key.
+    """
+    parameters_of(source, case, section)
+    names = Names(case)
+    for key, named in (("noise", section.noise), ("changes", section.changes)):
+        for name in named:
+            names.refuse_strange(name, f"identify.{key}")
+    for i, each in enumerate(section.candidates):
+        candidate(names, each, f"identify.candidates.{i}")
 
 
 def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Reading, str, float]:

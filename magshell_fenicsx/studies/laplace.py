@@ -6,12 +6,13 @@ With data d, their noise s and priors m +- t, the fit is least in
 
 and the posterior near it is normal with the covariance C = (J^T J/s^2 + 1/t^2)^-1, J = dy/dx (A. Tarantola, Inverse
 Problem Theory, SIAM 2005, section 3.2). Where s is estimated, from the residuals of a column over its degrees of
-freedom, quantiles are those of Student's t. Knows no shell.
+freedom f, quantiles are those of Student's t. A variance V that is the sum of parts V_c, one of the noise of each
+column and one of priors, has the degrees of freedom V^2/sum (V_c^2/f_c) (F. E. Satterthwaite, Biometrics Bulletin 2,
+110, 1946). Knows no shell.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -25,10 +26,10 @@ HALVINGS = 10
 APART = 1e-6  # a smaller singular value, over the largest, is a combination that data do not see
 NAMED = 0.1  # parts of a direction that are named
 RIGHT = 0.95  # of the bands
-AWAY = 2.0  # standard deviations at which the misfit is compared with its parabola
 LEAST = 1.0  # degree of freedom
+SAID = 0.5  # of a degree: with less, data do not say their noise
 EXACT = 1e-12  # no estimated noise is less than this part of the data
-NORMAL = 0.25  # relative difference of both at AWAY up to which the posterior counts as normal
+NORMAL = 0.25  # difference of the misfit from its parabola up to which the posterior counts as normal
 
 
 class NotSeen(ValueError):
@@ -37,6 +38,14 @@ class NotSeen(ValueError):
     def __init__(self, numbers: NDArray[np.int64]) -> None:
         self.numbers = [int(number) for number in numbers]
         super().__init__(f"parameters {self.numbers} are not determined")
+
+
+class NoNoise(ValueError):
+    """Parameters follow the data of this column so closely that these do not say their noise."""
+
+    def __init__(self, column: int) -> None:
+        self.column = column
+        super().__init__(f"the noise of column {column} is not determined")
 
 
 @dataclass(frozen=True)
@@ -81,6 +90,8 @@ class Fit:
     ----------
     x, y, slopes
         The parameters (p,), what is predicted there (n,), and its derivatives (n, p).
+    group
+        (n,) number of the column of each.
     noise, freedom
         Of each column: standard deviation, and degrees of freedom that it is estimated from (infinite if it is given).
     covariance
@@ -94,6 +105,7 @@ class Fit:
     x: Array
     y: Array
     slopes: Array
+    group: NDArray[np.int64]
     noise: Array
     freedom: Array
     covariance: Array
@@ -111,17 +123,30 @@ class Fit:
         """(p, p)."""
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
 
-    @cached_property
-    def quantile(self) -> float:
-        """Half the width of a 95 % band over a standard deviation."""
-        freedom = float(self.freedom.min())
-        law = scipy.stats.norm if np.isinf(freedom) else scipy.stats.t(freedom)
-        return float(law.ppf((1 + RIGHT) / 2))
+    def quantiles(self, slopes: Array, column: NDArray[np.int64] | None = None) -> Array:
+        """(k,) half the widths of 95 % bands over standard deviations, of numbers with these slopes (k, p).
+
+        Parameters
+        ----------
+        column
+            (k,) the columns whose noise they have too, as measured numbers.
+        """
+        of_data = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
+        columns = np.arange(len(self.noise))
+        parts = np.array([of_data[:, self.group == each].sum(axis=1) for each in columns]).T
+        whole = self.spread(slopes) ** 2
+        if column is not None:
+            own = self.noise[column] ** 2
+            parts, whole = parts + own[:, None] * (column[:, None] == columns), whole + own
+        share = parts / np.where(whole > 0, whole, 1.0)[:, None]
+        with np.errstate(divide="ignore"):
+            freedom = 1 / (share**2 / self.freedom).sum(axis=1)
+        return np.asarray(scipy.stats.t.ppf((1 + RIGHT) / 2, freedom))
 
     @property
     def band(self) -> tuple[Array, Array]:
         """The 95 % bands of the parameters."""
-        half = self.quantile * self.deviation
+        half = self.quantiles(np.eye(len(self.x))) * self.deviation
         return self.x - half, self.x + half
 
     def spread(self, slopes: Array) -> Array:
@@ -153,6 +178,8 @@ def fitted(
     ------
     NotSeen
         If data and priors leave a combination of parameters open.
+    NoNoise
+        If the noise of a column is to be estimated, and the parameters follow its data.
     """
     first = model(start)
     assert first, "there is a prediction at the start"
@@ -184,8 +211,10 @@ def fitted(
             break
         x, (y, J) = tried, there
         noise, freedom = _estimated(known, y, J, noise, size)
+    if (silent := np.flatnonzero(freedom < SAID)).size:
+        raise NoNoise(int(silent[0]))
     covariance = _covariance(known.rows(y, J, x, noise)[1], size)
-    return Fit(x, y, J, noise, freedom, covariance, misfit, step, ended)
+    return Fit(x, y, J, known.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended)
 
 
 def _covariance(A: Array, size: Array) -> Array:
@@ -222,15 +251,16 @@ def _estimated(known: Measured, y: Array, J: Array, noise: Array, size: Array) -
     share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
     for column in np.flatnonzero(np.isnan(known.noise)):
         own = known.group == column
-        freedom[column] = max(own.sum() - share[own].sum(), LEAST)
+        freedom[column] = own.sum() - share[own].sum()
         found[column] = max(
-            np.sqrt(((known.data - y)[own] ** 2).sum() / freedom[column]), EXACT * np.abs(known.data).max()
+            np.sqrt(((known.data - y)[own] ** 2).sum() / max(freedom[column], LEAST)),
+            EXACT * np.abs(known.data).max(),
         )
     return found, freedom
 
 
 def nonlinearity(model: Model, known: Measured, fit: Fit) -> tuple[float, int]:
-    """The largest relative difference of the misfit from its parabola, two deviations along each principal axis.
+    """The largest relative difference of the misfit from its parabola, at the ends of bands along principal axes.
 
     Returns
     -------
@@ -239,13 +269,13 @@ def nonlinearity(model: Model, known: Measured, fit: Fit) -> tuple[float, int]:
     size = fit.deviation
     spread, axes = np.linalg.eigh(fit.correlation)
     worst, lost = 0.0, 0
-    for s, axis in zip(spread, axes.T, strict=True):
-        for way in (-AWAY, AWAY):
+    for s, axis, far in zip(spread, axes.T, fit.quantiles(axes.T / size), strict=True):
+        for way in (-far, far):
             x = fit.x + way * size * np.sqrt(max(s, 0.0)) * axis
             there = model(x)
             if there is None:
                 lost += 1
                 continue
             rest = known.rows(*there, x, fit.noise)[0]
-            worst = max(worst, abs(float(rest @ rest - fit.misfit) / AWAY**2 - 1))
+            worst = max(worst, abs(float(rest @ rest - fit.misfit) / far**2 - 1))
     return worst, lost

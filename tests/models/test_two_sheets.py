@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.follow import follow
 
@@ -86,6 +88,19 @@ def test_pieces_that_overlap(tmp_path: Path) -> None:
     data["contact"] = [["upper", "lower"], ["upper", "shell"]]
     with pytest.raises(MeshError, match="contact: upper and shell: shares cells with upper and lower"):
         Scene(Case.model_validate(data))
+
+
+def test_check_knows_the_parts(tmp_path: Path) -> None:
+    """`magshell check` builds no model, and finds a pair with a wrong name, or that shares cells with another."""
+    data = pair(tmp_path, (1, 1), (1, 1), 1.0)
+    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
+    describe(Case.model_validate(data))
+    data["contact"] = [["upper", "lover"]]
+    with pytest.raises(CaseError, match="contact: lover: the surface has no such part, only lower, shell, upper"):
+        describe(Case.model_validate(data))
+    data["contact"] = [["upper", "lower"], ["shell", "upper"]]
+    with pytest.raises(CaseError, match="contact: shell and upper: shares cells with upper and lower"):
+        describe(Case.model_validate(data))
 
 
 def test_sheets_far_apart(tmp_path: Path) -> None:

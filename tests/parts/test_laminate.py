@@ -148,3 +148,13 @@ def test_what_is_refused() -> None:
             pressed(laminate, symmetry="axisymmetric").problem()
     with pytest.raises(CaseError, match="the fractions of the plies add up to 1: one alone has no gradient"):
         number_of(pressed({"plies": plies(0, 90)}).context, "shell.laminate.plies.0.fraction")
+    for size, said in ((1e10, "1e\\+10"), (1e-10, "1e-10")):
+        with pytest.raises(CaseError, match=rf"plies\.0\.E2: is {said} times youngs_modulus: allowed 1e-09 to 1e\+09"):
+            pressed({"plies": [plies(0)[0] | {"E1": 1e9, "E2": size, "nu12": 0}]})
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e300])
+def test_a_direction_of_any_length(length: float) -> None:
+    """Squares of such lengths are zero and infinite."""
+    section = LaminateSection.model_validate({"plies": plies(0), "along": [length, 0.0, length]})
+    assert section.direction("plate") == pytest.approx([np.sqrt(0.5), 0, np.sqrt(0.5)])

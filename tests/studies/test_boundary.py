@@ -155,6 +155,9 @@ def test_a_map_of_boundaries(tmp_path: Path) -> None:
         (f"{KEY}=1:2:3", "the second key of a map is another number"),
         ("shell.law=koiter,neo-hookean", "the second key of a map is another number"),
         ("mesh.size=0.1,0.2", "the second key of a map is another number"),
+        ("foundation.stiffness=1e-9:1e-9:3", "1e-09 stands twice"),
+        ("foundation.stiffness=1e-9,0.001e-6", "0.001e-6 stands twice"),
+        ("shell.nope=1,2", "--over shell.nope=1: shell.nope: unknown key"),
     ],
 )
 def test_what_is_no_map(tmp_path: Path, second: str, said: str) -> None:

@@ -237,3 +237,33 @@ def test_bands_of_200_repeats_and_metropolis(tmp_path: Path) -> None:
 def test_what_identifies_nothing(tmp_path: Path, data: str, settings: list[str], said: str) -> None:
     with pytest.raises(CaseError, match=said):
         ms.identify(case_file(tmp_path), data_file(tmp_path, data), settings, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        (
+            "identify.parameters={shell.nope: {}}",
+            "identify.parameters.shell.nope: shell.nope: the case has no such key",
+        ),
+        ("identify.candidates.0.of=nope", "identify.candidates.0.of: nope: has no gradient here"),
+        ("identify.candidates.1.noise=0.05", "identify.candidates.1.noise: 0.05: needs a unit"),
+        ("identify.changes=[tip_uz_cm]", "identify.changes: tip_uz_cm: the case has no such result"),
+        ("identify.noise={nope: 1 mm}", "identify.noise: nope: the case has no such result"),
+        ("identify.noise={tip_ux: 1 mm, tip_uz_mm: 1 mm}", ""),
+    ],
+)
+def test_check_looks_at_the_section(tmp_path: Path, setting: str, said: str) -> None:
+    """What needs no data is found by `magshell check`."""
+    done = magshell("check", case_file(tmp_path), "--set", setting)
+    assert done.returncode == (2 if said else 0)
+    assert said in done.stderr
+
+
+def test_one_datum_says_no_noise(tmp_path: Path) -> None:
+    """With a wide prior the fit would follow it, and the band were a point."""
+    data = data_file(tmp_path, "applied [mT],tip_uz [mm]\n10,5\n")
+    wide = "identify.parameters={shell.youngs_modulus: {prior: 1000 kPa, deviation: 1e6 kPa}}"
+    done = magshell("identify", case_file(tmp_path), "--data", data, "--out", tmp_path / "out", "--set", wide)
+    assert done.returncode == 2
+    assert "identify.noise: tip_uz: 1 data do not say the noise beside 1 parameters: give it" in done.stderr

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
 
 Array = NDArray[np.float64]
 T = np.linspace(0.2, 3.0, 12)
@@ -114,3 +114,48 @@ def test_what_data_do_not_see_is_named() -> None:
     assert fitted(product, one, np.array([1.0, 1.5]), np.ones(2), 30, lambda *_: None).x == pytest.approx(
         [1.0, 2.0], rel=1e-6
     )
+
+
+def mean_of(data: Array, deviation: float, noise: float = np.nan) -> Fit:
+    """A number that is measured itself, with the prior 0 +- deviation."""
+    known = Measured(
+        data, np.zeros(len(data), dtype=np.int64), np.array([noise]), np.zeros(1), np.array([float(deviation)])
+    )
+    slopes = np.ones((len(data), 1))
+    return fitted(lambda x: (x[0] + 0 * data, slopes), known, np.zeros(1), np.ones(1), 50, lambda *_: None)
+
+
+@pytest.mark.parametrize("deviation", [0.1, 0.3, 1.0])
+def test_few_data_beside_a_prior(deviation: float) -> None:
+    """300 numbers from the prior, each measured three times with unknown noise: 90 to 97 % lie in their bands.
+
+    Student's t alone, of about two degrees of freedom, makes bands that are wider than the prior's own.
+    """
+    rng, inside, widest = np.random.default_rng(1), [], 0.0
+    for _ in range(300):
+        truth = deviation * rng.normal()
+        low, high = mean_of(truth + rng.normal(size=3), deviation).band
+        inside.append(low[0] < truth < high[0])
+        widest = max(widest, high[0] - low[0])
+    assert 0.9 < np.mean(inside) < 0.97
+    assert widest < 1.1 * 2 * 1.96 * deviation
+
+
+def test_data_that_do_not_say_their_noise() -> None:
+    """One number measured once: the noise would follow the fit to zero, and the band with it."""
+    with pytest.raises(NoNoise):
+        mean_of(np.array([1.0]), 10.0)
+    assert mean_of(np.array([1.0]), 10.0, 0.5).deviation == pytest.approx([1 / np.hypot(1 / 10, 1 / 0.5)])
+
+
+def test_bands_that_are_wide_as_data_are_few() -> None:
+    """E of a spring y = 1/E from two data: linear two deviations away, and not at the ends of its band."""
+    data = np.array([0.95, 1.05])
+
+    def spring(x: Array) -> tuple[Array, Array] | None:
+        return None if x[0] <= 0 else (np.full(2, 1 / x[0]), np.full((2, 1), -1 / x[0] ** 2))
+
+    known = Measured(data, np.zeros(2, dtype=np.int64), np.array([np.nan]), np.ones(1), np.array([np.inf]))
+    own = fitted(spring, known, np.ones(1), np.ones(1), 20, lambda *_: None)
+    assert own.band[0] < 0.5
+    assert nonlinearity(spring, known, own)[0] > NORMAL

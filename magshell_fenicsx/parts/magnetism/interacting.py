@@ -62,6 +62,26 @@ class InteractionTerm:
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
 
+    def refuse_near(self) -> None:
+        """See that the undeformed parts are as far from each other as their cells can tell; collective.
+
+        Raises
+        ------
+        CaseError
+            On every rank, if they are not.
+        """
+        near = False
+        try:
+            nodes = self._nodes()
+            self._charged.rules(nodes, self._cells.own)
+        except Touching:
+            near = True
+        if self._comm.allreduce(near, MPI.LOR):
+            raise CaseError(
+                "magnetic.interaction: others: undeformed, two parts are nearer to each other than their thickness, or "
+                "than a seventh of the size of their cells: move them apart, or take smaller cells in the mesh file"
+            )
+
     def energy(self) -> float:
         return self._evaluated()[0]
 

@@ -3,11 +3,16 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.touching.section import WHOLE
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.touching.touching import Pair
 
@@ -47,6 +52,28 @@ class TouchingSeen(Seen):
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(pair.setting for pair in loads.pairs)
+
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """See that the surface has the parts of all pairs, and that no place is in two pairs.
+
+        Raises
+        ------
+        MeshError
+            With the name or the pairs.
+        """
+        inside = {**surface.patches, WHOLE: np.ones(len(surface.cells), dtype=bool)}
+        for number, pair in enumerate(loads.pairs):
+            for name in pair.names:
+                if name not in inside:
+                    there = ", ".join(sorted(inside))
+                    raise MeshError(f"contact: {name}: the surface has no such part, only {there}")
+            for before in loads.pairs[:number]:
+                for one, other in (pair.names, pair.names[::-1]):
+                    both = zip((one, other), before.names, strict=True)
+                    if all((inside[name] & inside[known]).any() for name, known in both):
+                        raise MeshError(
+                            f"contact: {pair.words}: shares cells with {before.words}: no place is in two pairs"
+                        )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return tuple(column for pair in loads.pairs for column in _columns(pair))

@@ -290,6 +290,13 @@ def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
     assert np.isnan(gradient(scene, u)).all()
 
 
+def test_parts_that_are_near_from_the_start(model: Any, tmp_path: Path) -> None:
+    """Their energy were no number: refused before anything is written, with what to do."""
+    strips(tmp_path / "near.msh", 4.0, 1.0, 0.3, 2.0)
+    with pytest.raises(CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"):
+        Scene(case_of(tmp_path / "near.msh", 0.1))
+
+
 SHELL = {"geometry": "mesh", "unit": "mm", "radius": "5 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
 REMANENT = {"polar": 0, "flux_density": "0.1 T"}
 WRONG = [

@@ -348,3 +348,22 @@ def test_rubber_that_swells_is_refused() -> None:
     shell = {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5}
     with pytest.raises(ValueError, match=r"sensors: needs the area as drawn; leave out natural\.stretch"):
         made(shell, FIELD, {"hall": {"position": [0, 0, 30 * MM]}}, natural={"stretch": 1.1})
+
+
+def test_units_of_sensors_and_what_they_are_called() -> None:
+    """Without units `field: total` is no length, and a sensor may have the name of a key."""
+    case: dict[str, Any] = {
+        "shell": {"geometry": "strip", "radius_to_thickness": 200, "width": 0.1, "poisson_ratio": 0},
+        "boundary": {"root": "clamped"},
+        "magnetic": {"susceptibility": 2, "lambda_m": 1e-3},
+        "sensors": {"at": {"position": [0, 0, 1], "field": "total"}},
+        "loading": {"kind": "field"},
+    }
+    Case.model_validate(case).problem()
+    case["sensors"]["at"]["position"][1] = "1 mm"
+    with pytest.raises(ValueError, match=r"sensors\.at\.position\.1: has a unit, but the shell's lengths have none"):
+        Case.model_validate(case)
+    case["sensors"] = {}
+    case["points"] = {"edge": [0.5, 0, "1 mm"]}
+    with pytest.raises(ValueError, match=r"points\.edge\.2: has a unit"):
+        Case.model_validate(case)
