@@ -327,9 +327,9 @@ class RevolutionSurface(SurfaceSection):
         """What is turned."""
         from magshell_fenicsx.mesh.revolved import Segment, Spline
 
-        curve = self.profile.curve / self.reference
-        (r0, z0), (r1, z1) = curve[:2].tolist()
-        profile: Profile = Segment((r0, z0), (r1, z1)) if len(curve) == 2 else Spline(curve)
+        curve = np.asarray(self.profile.curve / self.reference, dtype=np.float64)
+        start, end = ((float(r), float(z)) for r, z in curve[:2])
+        profile: Profile = Segment(start, end) if len(curve) == 2 else Spline(curve)
         return profile, ("bottom", None if curve[-1, 0] == 0 else "top")
 
     @property
