@@ -30,7 +30,7 @@ from magshell_fenicsx.output.pictures.view import (
     RELIEF,
     RIM,
     Camera,
-    Seen,
+    InView,
     Window,
     axes_on_screen,
     tessellated,
@@ -53,7 +53,7 @@ def plate(w: float) -> Surface:
 
 
 def test_axes_on_the_screen() -> None:
-    """Seen along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to the left."""
+    """InView along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to the left."""
     assert axes_on_screen(np.array([2.0, 0, 0])) == pytest.approx(np.array([[0, 0], [1, 0], [0, 1]]))
     assert axes_on_screen(np.array([0, 3.0, 0])) == pytest.approx(np.array([[-1, 0], [0, 0], [0, 1]]))
 
@@ -64,9 +64,9 @@ def test_a_place_is_seen_from_its_side() -> None:
         assert towards(place) @ place > 3 * np.linalg.norm(place)
 
 
-def seen(surface: Surface, width: int = 300) -> Seen:
+def seen(surface: Surface, width: int = 300) -> InView:
     camera = Camera(ABOVE)
-    return Seen.of(surface, camera, Window.around(camera(surface.r0), width))
+    return InView.of(surface, camera, Window.around(camera(surface.r0), width))
 
 
 def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
