@@ -53,7 +53,7 @@ def plate(w: float) -> Surface:
 
 
 def test_axes_on_the_screen() -> None:
-    """InView along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to the left."""
+    """Seen along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to the left."""
     assert axes_on_screen(np.array([2.0, 0, 0])) == pytest.approx(np.array([[0, 0], [1, 0], [0, 1]]))
     assert axes_on_screen(np.array([0, 3.0, 0])) == pytest.approx(np.array([[-1, 0], [0, 0], [0, 1]]))
 
