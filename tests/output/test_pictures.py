@@ -30,7 +30,7 @@ from magshell_fenicsx.output.pictures.view import (
     RELIEF,
     RIM,
     Camera,
-    Seen,
+    InView,
     Window,
     axes_on_screen,
     tessellated,
@@ -64,9 +64,9 @@ def test_a_place_is_seen_from_its_side() -> None:
         assert towards(place) @ place > 3 * np.linalg.norm(place)
 
 
-def seen(surface: Surface, width: int = 300) -> Seen:
+def seen(surface: Surface, width: int = 300) -> InView:
     camera = Camera(ABOVE)
-    return Seen.of(surface, camera, Window.around(camera(surface.r0), width))
+    return InView.of(surface, camera, Window.around(camera(surface.r0), width))
 
 
 def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
