@@ -21,7 +21,6 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.factor import Banded, Factorisation
-from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models import carriers
@@ -188,12 +187,6 @@ class Waves:
         """m -> number of unstable directions, for the waves that have any."""
         found = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
         return {m: count for m, count in found.items() if count}
-
-    def critical_eigenvalue(self, state: State, m: int) -> float:
-        """Eigenvalue of Q_m's matrix nearest to zero; negative where Q_m is unstable."""
-        unstable = self.negative_pivots(state, m) > 0
-        value, _ = nearest_to_zero(self._factorisation)
-        return -abs(value) if unstable else abs(value)
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
         v, u = fem.Function(self.V), carriers.revolved(self._system.u)

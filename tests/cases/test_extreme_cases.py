@@ -5,12 +5,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import CASES
-from extreme.extremes import ASPECTS, TIP, VARIANTS, Variant, line, outcome, slivers
+from extreme.extremes import ASPECTS, TIP, VARIANTS, Variant, condition_estimate, line, outcome, slivers
 from extreme.extremes_table import cells, write
+from mpi4py import MPI
+from petsc4py import PETSc
 
 from magshell_fenicsx import Case, Result
+from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.public import run
 
 
@@ -104,3 +108,15 @@ def test_table(tmp_path: Path) -> None:
     assert " | ".join(cells(row)) in (tmp_path / "README.md").read_text(encoding="utf-8")
     assert (tmp_path / "extremes.csv").read_text(encoding="utf-8").splitlines()[1].startswith("nothing,")
     assert {v.case for v in VARIANTS} | {"slivers"} == {file.stem for file in (CASES / "extreme").glob("*.yaml")}
+
+
+def test_condition_of_a_known_spectrum() -> None:
+    """Eigenvalues 1e-3 to 1e4, of both signs, in a random basis: condition 1e7."""
+    rng = np.random.default_rng(0)
+    values = np.array([1e-3, -0.5, 1.0, 2.0, -30.0, 1e4])
+    Q = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    K = PETSc.Mat().createDense((6, 6), array=Q @ np.diag(values) @ Q.T, comm=MPI.COMM_SELF).convert("aij")
+    K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    factors = Factorisation(MPI.COMM_SELF)
+    factors.factor(K)
+    assert condition_estimate(factors, 6, MPI.COMM_SELF) == pytest.approx(1e7, rel=1e-6)

@@ -367,7 +367,7 @@ def test_a_sweep_under_dead_loads(case_file: Path, tmp_path: Path) -> None:
     assert [float(factor) for factor in factors if factor] == [0, 1, 0, 1]
 
 
-def test_another_mesh_in_the_same_file_is_another_problem(case_file: Path, tmp_path: Path) -> None:
+def test_another_mesh_in_the_same_file_is_another_problem(case_file: Path, tmp_path: Path, no_pictures: None) -> None:
     def keys() -> list[str]:
         return [point.key for point in make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])]
 

@@ -48,7 +48,7 @@ def test_a_rigid_motion(symmetry: str, model: str, motion: dict[str, Any]) -> No
     there = reactions(scene.model, moved.point.state, problem.mirror)["rim"]
     turn = np.linalg.norm(motion.get("turn", 0.0))
     np.testing.assert_allclose(there.force / force, [np.sin(turn), 0, np.cos(turn)], atol=2e-3)
-    assert np.abs(there.moment).max() < 1e-9 * force or model == "solid"
+    assert np.abs(there.moment).max() < (2e-3 if model == "solid" else 1e-9) * force  # as its force is right
 
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])

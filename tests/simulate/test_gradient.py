@@ -170,9 +170,9 @@ def test_neutral_wave(tmp_path: Path) -> None:
     wave = solved(scene)
     assert wave.mode.startswith("m = ")
     found = gradient(scene, wave, of="instability", by=["remanence", "lambda_m", "magnetic.lambda_m"])
-    near = {c: with_values(scene, c * change) for c in (-2e-3, -1e-3, 1e-3, 2e-3)}
-    values = {c: adjoint_of_instability(other, solved(other)).value for c, other in near.items()}
-    expected = by_difference(values.__getitem__, 1e-3)
+    near = (with_values(scene, c * change) for c in (-1e-3, 1e-3))
+    back, ahead = (adjoint_of_instability(other, solved(other)).value for other in near)
+    expected = (ahead - back) / 2e-3
     assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(expected, rel=1e-4)
     whole = np.sum(of_points(scene, found["remanence"]) * scene.problem.loads.magnetic.remanent.values)  # type: ignore[union-attr]
     assert found["lambda_m"] == pytest.approx(whole / 0.001, rel=1e-9)  # the energy is linear in both

@@ -181,7 +181,7 @@ def test_a_static_step_needs_rest() -> None:
         case_of(PLATE, {"kind": "time", "duration": 1.0}, {"kind": "pressure"})
 
 
-def test_resumed(tmp_path: Path) -> None:
+def test_resumed(tmp_path: Path, no_pictures: None) -> None:
     """Stopped after each point by its time limit, and resumed: the same rows."""
     sudden = {"pressure": {"kind": "step", "to": 1e-4}}
     case = case_of(PLATE, {"kind": "time", "duration": 40.0, "points": 3, "history": sudden}, symmetry="axisymmetric")

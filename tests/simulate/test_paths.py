@@ -40,18 +40,19 @@ def test_volume_snaps_back() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("R_over_h", "lambda_m", "mode", "first", "fold", "control"),
-    [(300, 0.00184, "m = 28", 1.0145, 1.093385, "arc"), (1000, 0.0005, "m = 53", 0.9937, 1.0123, "volume")],
+    ("R_over_h", "lambda_m", "mode", "first", "fold", "error", "control"),
+    [(300, 0.00184, "m = 28", 1.0145, 1.093385, 1e-6, "arc"), (1000, 0.0005, "m = 53", 0.9937, 1.0123, 1e-4, "volume")],
 )
 def test_waves_before_the_fold(
-    R_over_h: int, lambda_m: float, mode: str, first: float, fold: float, control: str
+    R_over_h: int, lambda_m: float, mode: str, first: float, fold: float, error: float, control: str
 ) -> None:
     """Axisymmetric."""
     settings = f"shell.radius_to_thickness={R_over_h}", f"magnetic.lambda_m={lambda_m}", f"loading.control={control}"
     found = result("dimple_buckling.yaml", *settings)
     points = [found.limit_points[0], found.limit_points[-1]]
     assert [(p["kind"], p["mode"]) for p in points] == [("bifurcation", mode), ("fold", "")]
-    assert [p["value"] for p in points] == pytest.approx([first, fold], abs=1e-4)
+    assert points[0]["value"] == pytest.approx(first, abs=1e-4)
+    assert points[1]["value"] == pytest.approx(fold, abs=error)
     assert found.knockdown == found.limit_points[0]["value"]
 
 
@@ -101,7 +102,7 @@ def test_target_beyond_the_fold_in_units() -> None:
 @pytest.mark.slow
 def test_indentation_through_its_fold_in_displacement() -> None:
     """Mixed reference (hybridised Hellan-Herrmann-Johnson): peak 2.10, 1.3149 at w/h = 5, w turns back at 5.9."""
-    found = result("indentation_snap_back.yaml")
+    found = result("indentation_snap_back.yaml", "mesh.refinement=0.75")
     assert found.stopped is None
     forces = [value for amplitude, kind, value in events(found) if kind == "fold"]
     assert forces[0] == pytest.approx(2.10, abs=0.01)

@@ -131,7 +131,7 @@ def test_only_a_fold_is_one() -> None:
         ms.fold_at(scene, last)
 
 
-def test_columns_are_those_of_the_table(tmp_path: Path) -> None:
+def test_columns_are_those_of_the_table(tmp_path: Path, no_pictures: None) -> None:
     """Names, order and values of path.csv; but for the time."""
     case = ms.Case.load(CASES / "pole_indentation.yaml", ["mesh.degree=3"])
     ms.run(case, tmp_path)

@@ -50,7 +50,7 @@ def test_against_runs_through_the_cusp(tmp_path: Path) -> None:
     found = ms.boundary(ARCH, f"{KEY}=0.7:1.6:12", out=tmp_path / "b")
     assert not found.stopped
     ordinary = [row for row in found.rows if row["kind"] == "fold"]
-    for row in ordinary[:: max(1, len(ordinary) // 7)]:
+    for row in ordinary[:: max(1, len(ordinary) // 4)]:
         of_runs = folds(f"{KEY}={row['key']!r}")
         assert min(abs(load - row["load"]) for load in of_runs) < 1e-7 * abs(row["load"])
     work = found.content["factorisations"]

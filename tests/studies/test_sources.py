@@ -239,6 +239,7 @@ def test_runs_of_a_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, e
         assert said[-1].startswith(f"shell at refinement 0.5: computed again, {file}: is damaged")
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_mesh_file_that_changes_on_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All points of a sweep, and all of a run, are of the mesh that it began with."""
     (tmp_path / "bracket.msh").write_bytes((CASES.parent / "meshes" / "bracket.msh").read_bytes())
