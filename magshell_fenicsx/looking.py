@@ -57,7 +57,8 @@ def plot(
         return
     with exit_codes(stopped=(OSError,)):
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
-        alone = {"point": point, "animation": animation, "shapes": points_of(shapes), "whole": whole}
+        options |= {"whole": True} if whole else {}
+        alone = {"point": point, "animation": animation, "shapes": points_of(shapes)}
         print_line(plotted(folders, out, options, **alone))
 
 

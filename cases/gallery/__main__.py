@@ -10,6 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
+import magshell_fenicsx.parts.registered  # noqa: F401  # the columns of all parts, by which a path.csv is read
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.output.store.table import read_rows

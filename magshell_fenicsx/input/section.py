@@ -24,6 +24,8 @@ from pydantic import (
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
     PrivateAttr,
+    TypeAdapter,
+    ValidationError,
     ValidationInfo,
     field_validator,
 )
@@ -393,7 +395,12 @@ def _note(shell: Any, info: ValidationInfo) -> Any:
 NOTED = AfterValidator(_note)  # of the shell, which comes before the loads
 
 
-def over(unit: Unit) -> BeforeValidator:
+@dataclass(frozen=True, slots=True)
+class OverUnit(BeforeValidator):
+    """The validator of a number over a size of the case."""
+
+
+def over(unit: Unit) -> OverUnit:
     """A validator: text with a unit -> a number over a size of the case, such as h; a number is one already."""
 
     def convert(value: Any, info: ValidationInfo) -> Any:
@@ -408,4 +415,24 @@ def over(unit: Unit) -> BeforeValidator:
             raise ValueError(f"has a unit: that needs {unit.needs}; a number is in {unit.key}")
         return exact / size
 
-    return BeforeValidator(convert, json_schema_input_type=float | with_unit(unit.text))
+    return OverUnit(convert, json_schema_input_type=float | with_unit(unit.text))
+
+
+def is_over_unit(annotation: Any) -> bool:
+    """Whether a field with this annotation takes text with a unit as a number over a size of the case."""
+    parts = (annotation, *get_args(annotation))
+    return any(isinstance(each, OverUnit) for part in parts for each in getattr(part, "__metadata__", ()))
+
+
+def over_unit(annotation: Any, text: str, shell: Sized) -> float:
+    """The number that such a field makes of text with a unit.
+
+    Raises
+    ------
+    ValueError
+        If it is none, of another dimension, or the shell lacks what it needs.
+    """
+    try:
+        return float(TypeAdapter(annotation).validate_python(text, context={"given": given(shell)}))
+    except ValidationError as e:
+        raise ValueError(e.errors()[0]["msg"].removeprefix("Value error, ")) from None

@@ -246,14 +246,11 @@ class InTime:
 
     Attributes
     ----------
-    with_units
-        Whether its values may have a unit.
     refused
         Why it may not be one here; empty if it may.
     """
 
     name: str
-    with_units: bool
     refused: str
 
 

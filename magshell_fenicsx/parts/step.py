@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.section import Section, is_over_unit, over_unit
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -139,6 +139,17 @@ class Step(Section):
     def size(self, context: Context) -> float:
         """What a target of one is of the amplitude."""
         return 1.0
+
+    @classmethod
+    def level(cls, text: str, context: Context) -> float:
+        """A value of a history with a unit as a number, as the target of its load is without one.
+
+        Raises
+        ------
+        ValueError
+            If the target has no such unit, or the case lacks what it needs.
+        """
+        raise ValueError("its values have no unit: give a number")
 
     def of_history(self, value: float) -> float:
         """The amplitude at a value of a history, which is as the target is."""
@@ -336,6 +347,14 @@ class PathStep(Step):
         if self.snap != SnapSection() and not self.then:
             raise ValueError("snap: goes with then: snap")
         return self
+
+    @classmethod
+    def level(cls, text: str, context: Context) -> float:
+        for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
+            annotation = cls.model_fields[key].annotation
+            if is_over_unit(annotation):
+                return over_unit(annotation, text, context.shell)
+        return super().level(text, context)
 
     @property
     def ends(self) -> Until:

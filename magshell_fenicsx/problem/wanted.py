@@ -76,7 +76,8 @@ class CameraSection(Section):
 
 
 class OutputSection(Section):
-    """Pictures of a run; `magshell plot` has the same keys as options. PNG files are always drawn."""
+    """Pictures of a run, and shells for ParaView; `magshell plot` has the same keys as options. PNG files are always
+    drawn."""
 
     formats: list[Literal["png", "svg", "pdf"]] = Field(default_factory=list)
     """Further formats: svg and pdf have text as text, and the shell as an image"""
@@ -92,6 +93,8 @@ class OutputSection(Section):
     """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, stretch_1, stretch_2, stretch_3,
     sigma_1, sigma_2, p_mag, f_mag, k, tau, couple,
     gap_over_h, contact_pressure; by default those of the data"""
+    whole: bool = False
+    """With the pictures of a half shell, write the whole one at every point for ParaView: fields/whole.pvd"""
 
     @field_validator("ranges")
     @classmethod

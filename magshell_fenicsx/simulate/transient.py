@@ -22,9 +22,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.bodies.contact import Pressings
 from magshell_fenicsx.parts.course import SnapSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection
+from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection, level_in
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.turning import vectors_of
 from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
@@ -83,10 +82,8 @@ def time_of(problem: Problem, value: Time) -> float:
 def level_of(problem: Problem, name: str, value: Level) -> float:
     """A value of a history as an amplitude."""
     if name != "lambda_m":
-        return float(value)
-    magnetic = problem.context.of(MagneticSection)
-    applied = magnetic.applied.flux_density if magnetic else None
-    return problem.lambda_m * (float(in_units("tesla")(value)) / (applied or 1.0) if isinstance(value, str) else value)
+        return level_in(problem.context, name, value)
+    return problem.lambda_m * level_in(problem.context, "field", value)
 
 
 def _scaled(of: Curve, size: float, unit: float, amplitude: Callable[[float], float]) -> Curve:

@@ -30,9 +30,9 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     panels = 2 + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
     density, function, *others = figure.subplots(1, panels, squeeze=False)[0]
+    density.set(xlabel=label, ylabel="probability density")
     if len(values):
         _draw_distribution(density, function, values, results(rows, WITHOUT))
-    density.set(xlabel=label, ylabel="probability density")
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
     if strongest:
         _draw_correlation(others[0], rows, strongest[0], label)
@@ -59,20 +59,42 @@ def _draw_distribution(density: Any, function: Any, values: Array, without: Arra
         density.plot(x, fitted.density(x), color="C3")
         function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
     density.set_ylim(bottom=0)
+    if len(values) < FEW and not fitted:  # marks alone have no density
+        density.set(yticks=[], ylabel="")
     function.legend(frameon=False, fontsize=8)
 
 
 def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
     """The result over a column, with Spearman's correlation and how likely one as large is by chance."""
-    from scipy.stats import spearmanr
-
     pairs = np.array([(row[key], row[RESULT]) for row in rows if row[RESULT] is not None and row.get(key) is not None])
-    found, chance = spearmanr(*pairs.T)
+    found, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
     likely = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
     number = f"{found:.2f}".replace("-", "−")
     axes.set(xlabel=words(key), ylabel=label)
     axes.set_title(f"Spearman's correlation {number}, $n$ = {len(pairs)}, {likely}", fontsize=9)
+
+
+def correlation(x: Array, y: Array) -> tuple[float, float]:
+    """Spearman's correlation, and how likely one as large is by chance: of few samples from permutations.
+
+    Examples
+    --------
+    >>> [round(float(each), 4) for each in correlation(np.arange(4.0), np.arange(4.0))]  # 2 of 24 orders
+    [1.0, 0.0833]
+    """
+    from scipy.stats import permutation_test, rankdata, spearmanr
+
+    found, chance = spearmanr(x, y)
+    if len(x) >= FEW or np.isnan(found):
+        return float(found), float(chance)
+    ranks, other = (rankdata(each) - (len(x) + 1) / 2 for each in (x, y))
+
+    def together(values: Array, axis: int = -1) -> Array:
+        return np.asarray(np.sum(values * other, axis=axis))
+
+    tried = permutation_test((ranks,), together, permutation_type="pairings", vectorized=True, random_state=1)
+    return float(found), float(tried.pvalue)
 
 
 def words(key: str) -> str:

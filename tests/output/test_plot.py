@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 from PIL import Image
 
 import magshell_fenicsx as ms
@@ -51,6 +52,26 @@ def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) ->
     assert set(draw(again)) == there
     for name in there:
         assert (pixels(again / name) == pixels(run / name)).all(), name
+
+
+def test_whole_shells_of_a_half(tmp_path: Path) -> None:
+    """The key writes them beside the half in a run, and the area of the disc is pi."""
+    sections = {
+        "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+        "boundary": {"rim": "clamped"},
+        "symmetry": "half",
+        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-4, "points": 1},
+        "mesh": {"degree": 2, "refinement": 0.3},
+        "output": {"whole": True},
+    }
+    ms.run(ms.Case.from_source(Source("test", sections)), tmp_path)
+    half, whole = (pyvista.get_reader(tmp_path / f"fields/{name}.pvd") for name in ("path", "whole"))
+    assert half.time_values == whole.time_values == [0.0, 1e-4]
+    for reader, share in ((half, 0.5), (whole, 1.0)):
+        reader.set_active_time_value(1e-4)
+        shell = reader.read()[0].warp_by_vector("u").extract_surface(nonlinear_subdivision=3)
+        assert shell.area == pytest.approx(share * np.pi, rel=5e-3)
+    assert "fields/whole_0001.vtu" in (tmp_path / "written.txt").read_text()
 
 
 def test_a_torn_row_is_no_point(run: Path, tmp_path: Path) -> None:

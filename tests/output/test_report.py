@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.report.verdict import path_table, verdict
@@ -99,6 +100,16 @@ def test_one_file_with_every_picture_and_no_reference(tmp_path: Path) -> None:
     content = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "url(" not in content
     assert "@import" not in content
+
+
+@pytest.mark.parametrize(("width", "across"), [(90, 0), (180, 2)])
+def test_pictures_of_two_panels_are_across_the_page(width: int, across: int, tmp_path: Path) -> None:
+    """Beside each other their letters would be too small to read; of one panel each they are beside each other."""
+    Image.new("RGB", (round(width / 25.4 * 50), 40)).save(tmp_path / "wide.png", dpi=(50, 50))
+    curve = (tmp_path / "wide.png").read_bytes()
+    (tmp_path / "wide.png").unlink()
+    page(tmp_path, [FOLD], {"curve.png": curve, "shell.png": b"shell.png"})
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").count('<figure class="across"') == across
 
 
 def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:

@@ -158,6 +158,7 @@ def test_a_history_is_of_the_speed() -> None:
 
 
 def test_a_history_with_a_unit() -> None:
+    """As a target of the load; where the case has no units it says what it needs."""
     time = {"kind": "time", "duration": 1.0, "history": {"spin": {"kind": "step", "to": "200 rpm"}}}
-    with pytest.raises(CaseError, match=r"200 rpm: only the field's history has a unit, of a flux density such as"):
+    with pytest.raises(CaseError, match=r"history.spin: 200 rpm: has a unit: that needs density, youngs_modulus"):
         made(shell=CAP, boundary={"rim": "clamped"}, loading=[{"kind": "spin", "speed": 0.02}, time])

@@ -9,7 +9,9 @@ import pytest
 from command import magshell
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.parts.motion.step import level_in
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.rows import columns, rows
 from magshell_fenicsx.runs.summary import snaps
@@ -154,11 +156,40 @@ def test_histories(kind: str) -> None:
     assert found["time"][1:] == pytest.approx(np.arange(1, 9))
 
 
+def test_histories_in_units() -> None:
+    """A value means what a target of that load would, by the formulas of p_c, 2πD/R, h and √(E/ρ)/R."""
+    E, h, R, nu, rho = 1.2e6, 0.6e-3, 30e-3, 0.49, 1200.0
+    shell = {"geometry": "cap", "polar": 25, "radius": "30 mm", "thickness": "0.6 mm", "youngs_modulus": "1.2 MPa"}
+    expected = {
+        "pressure": ("400 Pa", 400 / (2 * E / np.sqrt(3 * (1 - nu**2)) * (h / R) ** 2)),
+        "force": ("2 mN", 2e-3 * 6 * R * (1 - nu**2) / (np.pi * E * h**3)),
+        "approach_ball": ("0.3 mm", 0.5),
+        "spin": ("200 rpm", 200 * np.pi / 30 * R / np.sqrt(E / rho)),
+        "field": ("-5 mT", -0.25),
+    }
+    time = {"kind": "time", "duration": "1 s", "history": {k: [[0, 0], ["1 s", v]] for k, (v, _) in expected.items()}}
+    case = case_of(
+        {
+            "shell": {**shell, "poisson_ratio": nu, "density": "1200 kg/m^3"},
+            "boundary": {"rim": "clamped"},
+            "bodies": {"ball": {"kind": "sphere", "radius": "5 mm"}},
+            "magnetic": {"remanent": {"flux_density": "50 mT"}, "applied": {"flux_density": "20 mT"}},
+        },
+        {"kind": "indentation", "depth": "0.1 mm"},
+        {"kind": "spin", "speed": "10 rpm"},
+        {"kind": "contact", "approach": "0.1 mm"},
+        time,
+    )
+    context = make_problem(case).context
+    for name, (text, value) in expected.items():
+        assert level_in(context, name, text) == pytest.approx(value, rel=1e-12), name
+
+
 MISTAKES = [
     ({"duration": "2 s"}, "a time with a unit needs shell.density, youngs_modulus and lengths"),
     ({"duration": -1.0}, "duration: -1.0: must be positive"),
     ({"history": {"force": "t"}}, "history.force: no such load; allowed: field, pressure"),
-    ({"history": {"pressure": [[0, 0], [1, "5 mT"]]}}, "5 mT: is a flux density: give a number"),
+    ({"history": {"pressure": [[0, 0], [1, "5 mT"]]}}, "history.pressure: 5 mT: is not convertible to pascal"),
     ({"history": {"field": "t"}}, "history.field: needs magnetic.lambda_m, not zero"),
     ({"history": {"pressure": [[1, 0], [0, 1]]}}, "the times of a table must not fall, nor be negative"),
     ({"history": {"pressure": "x + t"}}, "is not a formula of the time t"),

@@ -311,7 +311,7 @@ def read_point(folder: Path, number: int) -> tuple[Surface, About]:
 
 
 def write_whole_shells(folder: Path) -> list[str]:
-    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the names of the files.
+    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the files, none if it is whole.
 
     Raises
     ------
@@ -323,6 +323,8 @@ def write_whole_shells(folder: Path) -> list[str]:
     for row in rows:
         number = int(row["point"])
         surface, about = read_point(fields, number)
+        if about.mirror is None:
+            return []
         names.append(f"whole_{number:04d}.vtu")
         write_whole(fields / names[-1], vtu_content(surface, replace(about, mirror=None)))
     write_whole(fields / "whole.pvd", pvd_content(abscissae(rows), [[name] for name in names]))

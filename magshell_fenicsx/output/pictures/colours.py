@@ -50,6 +50,7 @@ SCALARS = {  # of the interactive report, in HTML; of vectors the length
     "contact_pressure": "contact pressure pR/(Eh)",
     "w0_over_h": "imperfections w<sub>0</sub>/h",
 }
+WITH_SIGN = {"w_over_h", *STRAINS, *MOMENTS, "sigma_1", "sigma_2", "p_mag", "k", "contact_pressure", "w0_over_h"}
 ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding
 ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
 LEAST_JUMP = 0.01  # per cent

@@ -78,7 +78,6 @@ def plot(
     animation: bool = False,
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
-    whole: bool = False,
 ) -> list[str]:
     """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
 
@@ -87,15 +86,13 @@ def plot(
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
     drawn = draw(folder, point, options, shapes)
-    more = [f"fields/{name}" for name in write_whole_shells(folder)] if whole else []
-    drawn += more[-1:]  # the list of the others
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
         write_report(folder)
         drawn.append("report.html")
-    note(folder, [*drawn, *more])
-    return drawn
+    note(folder, drawn)
+    return [name for name in drawn if not name.startswith("fields/whole_")]  # whole.pvd lists them
 
 
 def plotted(folders: Sequence[Path], out: Path, options: Mapping[str, Any], **alone: Any) -> str:
@@ -167,6 +164,8 @@ def draw(
     for name, content in _of_point(run, point) if point is not None else _of_run(run, shapes):
         write_whole(folder / name, content)
         names.append(name)
+    if run.style.whole:
+        names += [f"fields/{name}" for name in write_whole_shells(folder)]
     return names
 
 

@@ -21,8 +21,6 @@
   const shifts = about.u.map(scaled);
   const each = (values, c) => { const out = new Float32Array(values.length / 3); for (let i = 0; i < out.length; i++) out[i] = values[3 * i + c]; return out; };
   const corner = (c, of = triangles) => { const out = new Uint32Array(of.length / 3); for (let i = 0; i < out.length; i++) out[i] = of[3 * i + c]; return out; };
-  const signed = [[0, "#053061"], [0.1, "#2166ac"], [0.2, "#4393c3"], [0.3, "#92c5de"], [0.4, "#d1e5f0"], [0.5, "#ffffff"],
-    [0.6, "#fddbc7"], [0.7, "#f4a582"], [0.8, "#d6604d"], [0.9, "#b2182b"], [1, "#67001f"]];
   const state = {frame: about.opens, field: 0, factor: 1};
 
   const option = (select, value, text) => { const o = document.createElement("option"); o.value = value; o.innerHTML = text; select.append(o); };
@@ -77,7 +75,7 @@
   const shell = () => {
     const r = deformed(), f = about.fields[state.field];
     return {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0), j: corner(1), k: corner(2),
-      intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.low < 0 ? signed : "Viridis",
+      intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.colours.length ? f.colours : "Viridis",
       colorbar: {title: {text: f.label, side: "right"}, thickness: 12, len: 0.7, exponentformat: "power"}, flatshading: false,
       lightposition: lamp, lighting,
       hovertemplate: "%{intensity:.4g}<extra></extra>"};

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
-from magshell_fenicsx.output.pictures.colours import SCALARS, couple
+from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
+from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, from_zero
 from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, near_solids, run_camera, tessellated
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
@@ -32,6 +33,7 @@ from magshell_fenicsx.shape.solids import Solid
 Array = NDArray[np.float64]
 SAME = 1e-7  # places over R that are one vertex
 MOST = 8000  # triangles of a curved mesh
+STOPS = 33  # of a colour map
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,7 @@ def label(known: Quantity, row: Row, pole: str) -> str:
 
 
 def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed") -> list[dict[str, Any]]:
-    """Every scalar and every length of a vector, with the colour limits of the whole path."""
+    """Every scalar and every length of a vector, with the colours of the pictures and the limits of the whole path."""
     found = []
     for name, caption in SCALARS.items():
         values = [_values(shell, name, h) for shell in shells]
@@ -245,15 +247,29 @@ def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed
         if len(there) < len(shells):
             continue
         low, high = min(float(v.min()) for v in there), max(float(v.max()) for v in there)
-        if low < 0:
-            low, high = -max(-low, high), max(-low, high)
         if high - low < 1e-12:
             low, high = low - 1.0, low + 1.0
-        steps = [np.rint(255 * (mesh.at(v) - low) / (high - low)).astype(np.uint8) for v in there]
+        colours: list[tuple[float, str]] = []  # plotly's own map
+        if name == "gap_over_h":
+            low, high, colours = 0.0, 1.0, _stops(NEAR)
+        elif name in WITH_SIGN:
+            low, high = from_zero(low, high)
+            colours = _stops(SIGNED, (low, high))
+        parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in there]
+        steps = [np.rint(255 * part).astype(np.uint8) for part in parts]
         still = all((step == steps[0]).all() for step in steps)
         places = [packed.raw(step) for step in (steps[:1] if still else steps)]
-        found.append({"name": name, "label": caption, "low": low, "high": high, "at": places})
+        found.append({"name": name, "label": caption, "low": low, "high": high, "colours": colours, "at": places})
     return found
+
+
+def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[float, str]]:
+    """A colour map of the pictures as plotly takes it."""
+    from matplotlib.colors import to_hex
+
+    colours = colour_map(name, limits)
+    at = [*(float(t) for t in np.linspace(0.0, 1.0, STOPS)[:-1]), 1 - 1e-3, 1.0]
+    return [(t, to_hex(colours(t))) for t in at]
 
 
 def _values(surface: Surface, name: str, h: float) -> Array | None:

@@ -196,11 +196,12 @@ def _shown(case: dict[str, Any], rows: Sequence[Row]) -> str:
 
 def _pictures(folder: Path, shown_at: str, moving: bool) -> Iterator[tuple[str, str, bool]]:
     """Source and caption of each picture in the folder, and whether it is shown small."""
+    beside = all(_narrow((folder / name).read_bytes()) for name in SMALL if (folder / name).exists())
     for pattern, told in PICTURES.items():
         caption = told.replace("the last point", shown_at)
         for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
             content = base64.b64encode(light(file.read_bytes())).decode()
-            yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL
+            yield f"data:image/{file.suffix[1:]};base64,{content}", caption, beside and pattern in SMALL
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
@@ -270,7 +271,18 @@ def opened(file: Path) -> bool:
 
 
 LARGE = 250_000  # bytes
+COLUMN = 120.0  # mm
 WIDEST = 1100  # pixels: the width of the page
+
+
+def _narrow(content: bytes) -> bool:
+    """Whether a PNG file has a size of one column of a paper."""
+    if not content.startswith(b"\x89PNG"):
+        return True
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content)) as image:
+        return bool(image.width / image.info.get("dpi", (200.0,))[0] * 25.4 < COLUMN)
 
 
 def light(content: bytes) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.section import Direction
+from magshell_fenicsx.input.section import Direction, in_units
 from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
@@ -49,6 +49,13 @@ class FieldSection(PathStep):
 
     def size(self, context: Context) -> float:
         return strength(context)
+
+    @classmethod
+    def level(cls, text: str, context: Context) -> float:
+        magnetic = context.of(MagneticSection)
+        if magnetic is None or not magnetic.applied.flux_density:
+            raise ValueError("needs magnetic.applied.flux_density")
+        return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
     def course(self, here: Here) -> Course:
         until = "target" if self.until == "zero" else self.until

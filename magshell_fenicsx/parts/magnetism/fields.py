@@ -333,7 +333,7 @@ class MagneticSection(Section, Ability):
         why = "not after kind: rotation" if ANGLE in driven else ""
         if not strength(context):
             why = "needs magnetic.lambda_m, not zero"
-        return InTime("field", self.applied.flux_density not in (None, 0.0), why)
+        return InTime("field", why)
 
     def patches(self) -> dict[str, Iterable[str]]:
         values = {

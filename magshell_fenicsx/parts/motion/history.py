@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.input.section import Section, in_units, with_unit
+from magshell_fenicsx.input.section import Section, in_units, number_and_unit, with_unit
 from magshell_fenicsx.parts.part import Ability, Context
 
 Value = Callable[[Any], float]  # a time or a level as a plain number
@@ -27,18 +27,15 @@ def measured(unit: str) -> Any:
 
 
 def _level(value: float | str) -> float | str:
-    try:
-        in_units("tesla")(value)
-    except ValueError:
-        raise ValueError(
-            f"{value}: only the field's history has a unit, of a flux density such as 60 mT; of another load give a "
-            "number as its target is without a unit"
-        ) from None
+    if isinstance(value, str) and not number_and_unit(value)[1]:
+        raise ValueError('is not a number with a unit such as "400 Pa"')
     return value
 
 
 Time: TypeAlias = measured("second")  # type: ignore[valid-type]
-Level: TypeAlias = Annotated[float | with_unit("tesla"), AfterValidator(_level)]  # type: ignore[valid-type]
+Level: TypeAlias = Annotated[  # what its unit means depends on the load
+    float | Annotated[str, Field(examples=["400 Pa"])], AfterValidator(_level)
+]
 
 
 class RampHistory(Section):
@@ -46,8 +43,9 @@ class RampHistory(Section):
 
     kind: Literal["ramp"]
     to: Level
-    """Value at its end. Of the field: a flux density, or a part of that in `magnetic`. Of a spin: the speed. Of every
-    other load: the number that its target would have without a unit, such as 0.5 of p_c"""
+    """Value at its end, as a target of the load would be, with a unit or without one: 400 Pa or 0.5 of p_c, a force, an
+    approach, the speed of a spin, the factor of a support. Of the field: a flux density, or a part of that in
+    `magnetic`"""
     over: Time
     """Time that it takes"""
 

@@ -9,7 +9,7 @@ from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.course import Ahead, Errors
-from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
+from magshell_fenicsx.parts.motion.history import History, Level, Time, levels_of, measured, times_of
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves, alike
@@ -59,8 +59,8 @@ class TimeSection(Step):
     """Equal parts of the duration, each a row"""
     history: dict[str, History] = Field(default_factory=dict)
     """Load -> its values over the time of the step: `field` (over that of `magnetic`, or as a flux density), `pressure`
-    (over p_c), or the amplitude of another step: a ramp, step, triangle or sine, a table [[time, value], ...] with
-    straight lines and jumps, or a formula of the time t"""
+    (over p_c, or as 400 Pa), or the amplitude of another step, as its target: a ramp, step, triangle or sine, a table
+    [[time, value], ...] with straight lines and jumps, or a formula of the time t without units"""
     rho_inf: float = Field(default=0.8, ge=0, le=1)
     """Factor by which the highest frequencies fade at each step; 1 conserves energy"""
     step: Time | None = None
@@ -146,11 +146,10 @@ class TimeSection(Step):
             if jumps and name in loads and not loads[name].jumps:
                 raise ValueError(f"{key}.history.{name}: a support cannot jump")
             for level in levels_of(history):
-                if isinstance(level, str) and not (name in timed and timed[name].with_units):
-                    why = (
-                        "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
-                    )
-                    raise ValueError(f"{key}.history.{name}: {level}: {why}")
+                try:
+                    level_in(context, name, level)
+                except ValueError as e:
+                    raise ValueError(f"{key}.history.{name}: {level}: {e}") from None
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         if not self.velocity:
@@ -170,6 +169,22 @@ class TimeSection(Step):
         for name, history in self.history.items():
             given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
         yield from ((key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str))
+
+
+def level_in(context: Context, name: str, level: Level) -> float:
+    """A value of the history of a load as a number, as a target of that load would be.
+
+    Raises
+    ------
+    ValueError
+        If it has a unit that the load has not in this case.
+    """
+    from magshell_fenicsx.parts.registered import STEPS  # which has this step too
+
+    if not isinstance(level, str):
+        return level
+    own = next((type(step.load) for step in context.steps if step.name == name), None)
+    return (own or STEPS[name]).level(level, context)
 
 
 def history_may_begin(history: History) -> bool:
