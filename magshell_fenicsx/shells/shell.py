@@ -266,9 +266,9 @@ class ShellModel(Thin):
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
-        for term in terms:
-            if isinstance(term, InteractionTerm):  # now that all is there which it reads
-                term.refuse_near()
+        for each in terms:
+            if isinstance(each, InteractionTerm):  # now that all is there which it reads
+                each.refuse_near()
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
