@@ -13,7 +13,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
 from magshell_fenicsx.mesh.hexahedra import MIDDLE
-from magshell_fenicsx.mesh.mirror import Mirror, cut
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
@@ -133,7 +133,9 @@ class Problem:
     meridian
         What is modelled instead of the surface; None if that is modelled.
     mirror
-        Plane of the half that is modelled; None for all.
+        Plane of the half, or both planes of the sector, that is modelled; None for all.
+    turns
+        Whether all parts are axisymmetric, whatever is modelled.
     azimuth
         The model's frame is turned about e3 by it (rad).
     shape, size, points, embedding
@@ -184,6 +186,7 @@ class Problem:
     size: Size
     included: list[str]
     left_out: list[str]
+    turns: bool = False
     thickness: Thickness | None = None
     length: float = 1.0
     pressed: tuple[tuple[float, float], ...] = ()
@@ -283,6 +286,7 @@ class Problem:
         else:
             patch = triangulate(self.shape, self.size, self.points, self.embedding)
         whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
+        whole = whole and not isinstance(self.mirror, Sector)  # whose chart is narrower
         return cut(patch, self.mirror) if self.mirror and whole else patch
 
 

@@ -129,7 +129,7 @@ def own_wave(scene: Scene) -> str:
     """The wave of the model's own modes."""
     if scene.model.axisymmetric:
         return "0"
-    return "symmetric" if scene.model.multiplicity == 2 else ""
+    return "symmetric" if scene.model.multiplicity > 1 else ""
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:

@@ -145,7 +145,7 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
             yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
         for m in range(1, waves.largest + 1):
             yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass)
-    elif model.excluded_modes is not None:
+    elif model.multiplicity == 2 and model.excluded_modes is not None:
         yield of("antisymmetric", model.excluded_modes.system)
 
 

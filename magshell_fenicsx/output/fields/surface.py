@@ -1,6 +1,6 @@
 """The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from dolfinx.cpp.io import perm_vtk
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
@@ -250,6 +250,28 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         surface.jump,
         surface.strain_jump,
         surface.solids,
+    )
+
+
+def whole(surface: Surface, mirror: Mirror) -> Surface:
+    """All of the shell from the half, or the sector, that is modelled."""
+    found = completed(surface, mirror.plane)
+    if not isinstance(mirror, Sector):
+        return found
+    turns = [image.Q.T for image in mirror.images if image.sign > 0]
+    copies = [_moved(found, Q) for Q in turns]
+    count = len(found.r0)
+
+    def every(of: Callable[[Surface], Array]) -> Array:
+        return np.concatenate([of(copy) for copy in copies])
+
+    return replace(
+        found,
+        r0=every(lambda s: s.r0),
+        u=every(lambda s: s.u),
+        n0=every(lambda s: s.n0),
+        cells=np.concatenate([found.cells + k * count for k in range(len(copies))]),
+        fields={name: every(lambda s, name=name: s.fields[name]) for name in found.fields},  # type: ignore[misc]
     )
 
 
