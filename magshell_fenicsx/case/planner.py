@@ -300,7 +300,7 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         raise CaseError(f"symmetry: axisymmetric: {reason}")
     if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
         return True, None
-    if isinstance(case.symmetry, int) and case.symmetry > 1:
+    if isinstance(case.symmetry, int):
         places = [np.array(x) for x in case.points.values()]
         if found := sector(parts, drawn, case.symmetry, places):
             return False, found
@@ -308,11 +308,10 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
             f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
             f"angle of {180 / case.symmetry:g} degrees with all named points between them"
         )
-    if case.symmetry not in ("auto", "half", 1):
+    if case.symmetry not in ("auto", "half"):
         return False, None
-    asked = case.symmetry in ("half", 1)
-    plane = mirror(parts, drawn, loosely=asked)
-    if asked and plane is None:
+    plane = mirror(parts, drawn, loosely=case.symmetry == "half")
+    if case.symmetry == "half" and plane is None:
         if name := unmirrored(parts, drawn):
             raise CaseError(f"symmetry: half: the energy {name} does not share it")
         made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"

@@ -113,7 +113,7 @@ class Mirror:
 
     def image(self, x: Array) -> Array:
         """Mirrored places (..., 3)."""
-        return np.asarray(x - 2 * self.beyond(x)[..., None] * self.normal)
+        return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
 
     def beyond(self, x: Array) -> Array:
         """Distances (...) from the plane, positive in the half that is modelled."""
@@ -158,7 +158,7 @@ class Sector(Mirror):
     Attributes
     ----------
     waves
-        m, at least 2.
+        m, at least 1.
     """
 
     waves: int = 2

@@ -62,7 +62,7 @@ class DiscShape:
     edge
         Name of its outer edge.
     waves
-        m of the sector of 180/m degrees that is what is left of a half; 1 for all of it.
+        m of the sector of 180/m degrees that is left of a half; 1 for all of it.
     """
 
     radius: float

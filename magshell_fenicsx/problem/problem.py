@@ -16,8 +16,9 @@ from magshell_fenicsx.mesh.hexahedra import MIDDLE
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
-from magshell_fenicsx.mesh.shapes import Shape
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.mesh.unfolding import doubled
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import Inside
@@ -276,6 +277,17 @@ class Problem:
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         return patch
 
+    def _triangulated(self, shape: Shape) -> PatchMesh:
+        """A shape by gmsh: a sector from one half of it, so that the mesh tells crests of waves from troughs in nothing."""
+        if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
+            return triangulate(shape, self.size, self.points, self.embedding)
+        if shape.rims:
+            return triangulate(replace(shape, waves=self.mirror.waves), self.size, self.points, self.embedding)
+        middle = Mirror.upright(self.mirror.angle / 2)
+        points = {name: x if middle.beyond([*x, 0.0]) <= 0 else middle.image([*x, 0.0])[:2] for name, x in self.points.items()}
+        half = triangulate(replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding)
+        return replace(doubled(half, self.mirror.angle), points=dict(self.points))
+
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
             return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
@@ -284,7 +296,7 @@ class Problem:
         if isinstance(self.shape, Grid):
             patch = grid_mesh(self.shape, self.points, self.embedding)
         else:
-            patch = triangulate(self.shape, self.size, self.points, self.embedding)
+            patch = self._triangulated(self.shape)
         whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
         whole = whole and not isinstance(self.mirror, Sector)  # whose chart is narrower
         return cut(patch, self.mirror) if self.mirror and whole else patch

@@ -7,7 +7,6 @@ left out of the count, which would depend on rounding.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,95 +18,14 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Sector, rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.mirror import CUT, Sector
+from magshell_fenicsx.mesh.unfolding import Folding, unfolded
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-CLOSE = 1e-7  # over the chart's extent: nodes that are one
 SEEN = 1e-3  # in lengths: a state that differs less around e3 is axisymmetric
-TURNED_OVER = {3: [0, 2, 1], 6: [0, 2, 1, 5, 4, 3], 10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9]}  # gmsh's nodes of a mirrored cell
-
-
-class Folding:
-    """The copies of a sector that make a half: copy k lies between the azimuths k and k + 1 times its angle.
-
-    Parameters
-    ----------
-    chart
-        Coordinates (n, 2) of a disc around the axis, or of a rectangle whose first axis goes around e3.
-    """
-
-    def __init__(self, sector: Sector, patch: PatchMesh) -> None:
-        self.waves, self._angle = sector.waves, sector.angle
-        places, turn = patch.embedding(patch.nodes), rotation(-sector.angle)
-        turned = patch.embedding(patch.nodes @ turn[:2, :2].T)
-        self.round = bool(np.abs(turned - places @ turn.T).max() < CLOSE * np.abs(places).max())
-        self.end = sector.angle if self.round else float(patch.nodes[:, 0].max())
-
-    def image(self, chart: Array, k: int) -> Array:
-        """Copy k of places of the chart."""
-        if self.round:
-            return chart @ self.turn(k)[:2, :2].T
-        x = (k + 1) * self.end - chart[:, 0] if k % 2 else k * self.end + chart[:, 0]
-        return np.column_stack([x, chart[:, 1]])
-
-    def turn(self, k: int) -> Array:
-        """The matrix (3, 3) that takes vectors of the sector to copy k."""
-        if k % 2:
-            return rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0])
-        return rotation(-k * self._angle)
-
-    def copies(self, chart: Array) -> NDArray[np.int64]:
-        """In which copy each place (n, 2) of the half lies."""
-        along = np.arctan2(chart[:, 1], chart[:, 0]) if self.round else chart[:, 0]
-        return np.clip(np.floor(along / self.end), 0, self.waves - 1).astype(np.int64)
-
-    def back(self, chart: Array) -> Array:
-        """The places of the sector whose copies these are."""
-        found, copies = np.empty_like(chart), self.copies(chart)
-        for k in range(self.waves):
-            here = copies == k
-            if self.round:
-                found[here] = chart[here] @ self.turn(k)[:2, :2]
-            else:
-                x = chart[here, 0]
-                found[here, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
-                found[here, 1] = chart[here, 1]
-        return found
-
-
-def unfolded(patch: PatchMesh, folding: Folding) -> PatchMesh:
-    """The triangulation of the half, from that of the sector."""
-    n, waves = len(patch.nodes), folding.waves
-    nodes = np.concatenate([folding.image(patch.nodes, k) for k in range(waves)])
-    over = TURNED_OVER[patch.cells.shape[1]]
-    cells = np.concatenate([k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(waves)])
-    tree = scipy.spatial.cKDTree(nodes)
-    near = tree.query_ball_point(nodes, CLOSE * np.ptp(nodes, axis=0).max())
-    same = np.array([min(each) for each in near])
-    one = np.arange(n) if patch.one is None else patch.one
-    glued = same[np.concatenate([k * n + one for k in range(waves)])]
-    used, numbers = np.unique(same, return_inverse=True)
-    new = np.full(len(nodes), -1, dtype=np.int64)
-    new[used] = np.arange(len(used))
-
-    def copied(name: str, ks: Sequence[int]) -> NDArray[np.int64]:
-        return np.concatenate([new[glued[k * n + patch.edges[name]]] for k in ks])
-
-    last = waves - 1
-    edges = {name: copied(name, range(waves)) for name in patch.edges if name not in (CUT, SECOND_CUT)}
-    edges[CUT] = np.concatenate([copied(CUT, [0]), copied(CUT if last % 2 else SECOND_CUT, [last])])
-    return replace(
-        patch,
-        nodes=nodes[used],
-        cells=numbers[cells],
-        edges=edges,
-        one=None if patch.one is None else new[glued[used]],
-        patches={name: np.tile(inside, waves) for name, inside in patch.patches.items()},
-    )
 
 
 class UnfoldedModes:
@@ -132,8 +50,8 @@ class UnfoldedModes:
         """The model whose tangents are counted."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
-        self._folding = Folding(sector, patch)
-        half = self._as_half(distribute(unfolded(patch, self._folding), self._model.system.comm))
+        self._folding = Folding(sector.angle, sector.waves, patch)
+        half = self._as_half(distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm))
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))
         self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.back(chart))[1]
