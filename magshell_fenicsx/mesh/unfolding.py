@@ -12,7 +12,11 @@ from magshell_fenicsx.mesh.patch import PatchMesh
 
 Array = NDArray[np.float64]
 CLOSE = 1e-7  # over the chart's extent: nodes that are one
-TURNED_OVER = {3: [0, 2, 1], 6: [0, 2, 1, 5, 4, 3], 10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9]}  # gmsh's nodes of a mirrored cell
+TURNED_OVER = {
+    3: [0, 2, 1],
+    6: [0, 2, 1, 5, 4, 3],
+    10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9],
+}  # gmsh's nodes of a mirrored cell
 
 
 class Folding:
@@ -38,20 +42,20 @@ class Folding:
     def image(self, chart: Array, k: int) -> Array:
         """Copy k of places of the chart."""
         if self.round:
-            return chart @ self.turn(k)[:2, :2].T
+            return np.asarray(chart @ self.turn(k)[:2, :2].T)
         x = (k + 1) * self.end - chart[:, 0] if k % 2 else k * self.end + chart[:, 0]
         return np.column_stack([x, chart[:, 1]])
 
     def turn(self, k: int) -> Array:
         """The matrix (3, 3) that takes vectors of the sector to copy k."""
         if k % 2:
-            return rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0])
+            return np.asarray(rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0]))
         return rotation(-k * self._angle)
 
     def copies(self, chart: Array) -> NDArray[np.int64]:
         """In which copy each place (n, 2) of the half lies."""
         along = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]  # at pi rounding has a sign
-        return np.clip(np.floor(along / self.end), 0, self.count - 1).astype(np.int64)
+        return np.asarray(np.clip(np.floor(along / self.end), 0, self.count - 1), dtype=np.int64)
 
     def back(self, chart: Array) -> Array:
         """The places of the sector whose copies these are."""
@@ -88,7 +92,9 @@ def unfolded(patch: PatchMesh, folding: Folding, ends: tuple[str, str]) -> Patch
     last = count - 1
     edges = {name: copied(name, range(count)) for name in patch.edges if name not in (CUT, SECOND_CUT)}
     first, second = copied(CUT, [0]), copied(CUT if last % 2 else SECOND_CUT, [last])
-    edges |= {CUT: np.concatenate([first, second])} if ends == (CUT, CUT) else dict(zip(ends, (first, second), strict=True))
+    edges |= (
+        {CUT: np.concatenate([first, second])} if ends == (CUT, CUT) else dict(zip(ends, (first, second), strict=True))
+    )
     return replace(
         patch,
         nodes=nodes[used],

@@ -278,13 +278,12 @@ class Problem:
         return patch
 
     def _triangulated(self, shape: Shape) -> PatchMesh:
-        """A shape by gmsh: a sector from one half of it, so that the mesh tells crests of waves from troughs in nothing."""
+        """A shape by gmsh: a sector from one half of it, whose mesh then tells no crests of waves from troughs."""
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
-        if shape.rims:
-            return triangulate(replace(shape, waves=self.mirror.waves), self.size, self.points, self.embedding)
         middle = Mirror.upright(self.mirror.angle / 2)
-        points = {name: x if middle.beyond([*x, 0.0]) <= 0 else middle.image([*x, 0.0])[:2] for name, x in self.points.items()}
+        at = {name: np.append(x, 0.0) for name, x in self.points.items()}
+        points = {name: (x if middle.beyond(x) <= 0 else middle.image(x))[:2] for name, x in at.items()}
         half = triangulate(replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding)
         return replace(doubled(half, self.mirror.angle), points=dict(self.points))
 

@@ -42,9 +42,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return (
-        turned(whole(found, problem.mirror) if problem.mirror else found, problem.azimuth) if found else None
-    )
+    return turned(whole(found, problem.mirror) if problem.mirror else found, problem.azimuth) if found else None
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":

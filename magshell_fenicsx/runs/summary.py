@@ -229,7 +229,11 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "barrier": result.barrier,
         "snaps": snapped,
         **({"snap_time_ms": 1e3 * snapped[0]["time"] * sizes.size("time")} if snapped and sizes.unit("time") else {}),
-        **{key: said for room in SEEN for key, said in room.summary(result.scene_of(result.end).sight, result.last).items()},
+        **{
+            key: said
+            for room in SEEN
+            for key, said in room.summary(result.scene_of(result.end).sight, result.last).items()
+        },
         "frequencies": [
             {
                 "point": number,

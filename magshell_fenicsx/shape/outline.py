@@ -307,7 +307,11 @@ def _between(grid: Grid, sector: Sector) -> Grid:
     parts = tuple(end * part for part in (0.25, 0.5, 0.75))
     sides = (CUT, SECOND_CUT, *grid.sides[2:])
     return replace(
-        grid, low=(0.0, grid.low[1]), high=(end, grid.high[1]), sides=sides, glued=(False, grid.glued[1]),
+        grid,
+        low=(0.0, grid.low[1]),
+        high=(end, grid.high[1]),
+        sides=sides,
+        glued=(False, grid.glued[1]),
         through=(parts, grid.through[1]),
     )
 

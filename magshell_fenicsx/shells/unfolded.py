@@ -20,6 +20,7 @@ from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import CUT, Sector
 from magshell_fenicsx.mesh.unfolding import Folding, unfolded
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
@@ -72,7 +73,7 @@ class UnfoldedModes:
         self._others.factor(half.system.tangent(there.u, there.mu))
         symmetric = self._others.negative_pivots - own
         modes = half.excluded_modes
-        assert modes is not None
+        assert isinstance(modes, AntisymmetricModes)
         factors = modes.factor_at(there)
         antisymmetric = factors.negative_pivots
         t = self._turning(there)
@@ -80,10 +81,14 @@ class UnfoldedModes:
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]
 
+    def is_unstable(self, state: State) -> bool:
+        """Whether such a mode is unstable."""
+        return any(self.counts(state))
+
     def _turning(self, state: State) -> Vector | None:
         """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None without any."""
         half, system, modes = self.half, self.half.system, self.half.excluded_modes
-        if modes is None or not self._model.turns:
+        if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
             return None
         V = half.V
         u, r0 = system.with_ghosts(state.u, state.mu).reshape(-1, 3), half.r0.x.array.reshape(-1, 3)
@@ -99,4 +104,3 @@ class UnfoldedModes:
         t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]
         t = modes.system.held(t.ravel()[: system.size])
         return t if max_abs(system.comm, t) > SEEN * system.length else None
-

@@ -78,14 +78,13 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                     first = record
             release = step.load.released_by
             if release and record and step.until == "bifurcation" and last == "bifurcation":
-                record = departure_of(scene, step, record).record("step", 0)
+                record = departure_of(scene, step, record).record(0)
                 scene = record.scene or scene
                 yield _told(scene, step, record, remark, where)
             elif release and record:
                 if record.label != "fold" or record.mode:
-                    raise Stopped(
-                        f"then: snap: the step ends at a {record.mode or record.label}, not at a fold of the model itself"
-                    )
+                    at = record.mode or record.label
+                    raise Stopped(f"then: snap: the step ends at a {at}, not at a fold of the model itself")
                 if record.excluded_pivots:
                     remark(where + _buckled(scene, record, first))
             further = None

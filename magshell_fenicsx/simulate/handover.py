@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, branching, find_bifurcation
 from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.input.source import CaseError
@@ -63,15 +63,14 @@ class Departure:
     def scene(self) -> Scene:
         return self.stage.scene
 
-    def record(self, label: str, number: int) -> Record:
+    def record(self, number: int) -> Record:
         """The point in the model's own amplitudes and displacements."""
         found = self.stage.point(self.point)
         point = replace(found, state=self.scene.model.system.advance(found.state, found.state.mu))
         unseen = self.scene.model.excluded_modes
         counts = sum(unseen.counts(point.state)) if unseen else 0
-        return Record(
-            label, self.path.name, point, branch=number, excluded_pivots=counts, said=self.said, scene=self.scene  # type: ignore[arg-type]
-        )
+        of = {"branch": number, "excluded_pivots": counts, "said": self.said, "scene": self.scene}
+        return Record("step", self.path.name, point, **of)  # type: ignore[arg-type]
 
 
 def departed(stage: Stage, found: Record, scale: float) -> Departure:
@@ -139,9 +138,7 @@ def larger(scene: Scene, mode: str) -> Scene:
     raise Stopped(f"no model has the mode {mode}: {why}")
 
 
-def leaving(
-    stage: Stage, found: Record, goal: Goal, scale: float, number: int
-) -> Records:
+def leaving(stage: Stage, found: Record, goal: Goal, scale: float, number: int) -> Records:
     """The records of the branch at a bifurcation in the model that has its mode; its value is the state at their end.
 
     One direction is followed: the other is the same shape, turned about e3 or mirrored.
@@ -157,7 +154,7 @@ def leaving(
         If the branch is not found, or lost.
     """
     departure = departed(stage, found, scale)
-    yield departure.record("step", number)
+    yield departure.record(number)
     crossing = branching(departure.path, departure.point)
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({found.mode}) is not found")
@@ -238,9 +235,7 @@ def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
     return s, theta
 
 
-def _revolved(
-    model: MeridianModel, s: Array, theta: Array, u: Vector, wave: Vector, m: int
-) -> tuple[Array, Array]:
+def _revolved(model: MeridianModel, s: Array, theta: Array, u: Vector, wave: Vector, m: int) -> tuple[Array, Array]:
     """u(s) and the wave U cos e_rho + V sin e_theta + W cos e_z at places, (n, 3) each; the crest of u . n inwards."""
     radial, axial = _evaluated(model, model.V, u, s).T
     U_and_V, V, W = _evaluated(model, model.excluded_modes.waves.V, wave, s).T
@@ -248,7 +243,7 @@ def _revolved(
     e_rho, e_theta = np.column_stack([cos, sin, zero]), np.column_stack([-sin, cos, zero])
 
     def in_space(a: Array, b: Array, c: Array) -> Array:
-        return a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c])
+        return np.asarray(a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c]))
 
     waved = in_space((U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta))
     return in_space(radial, zero, axial), _sign(model, wave) * waved
@@ -304,4 +299,3 @@ def through(x: Array, values: Array, wanted: Array) -> Array:
     weight = np.exp(-4 * (a**2 + b**2))
     fit = np.linalg.pinv(weight[..., None] * basis) @ (weight[..., None] * values[near])
     return np.asarray(fit[:, 0])
-

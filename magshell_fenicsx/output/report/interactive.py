@@ -17,8 +17,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.surface import on_nodes_of
+from magshell_fenicsx.output.fields.surface import Surface, on_nodes_of
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named

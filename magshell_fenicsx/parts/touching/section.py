@@ -37,7 +37,7 @@ def leaves(given: Sequence[Sequence[str]]) -> list[Leaves]:
     return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)] if given else []
 
 
-def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str) -> None:
+def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:
     """See that a model can have these contacts.
 
     Raises
