@@ -131,6 +131,8 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     rims = different(local)
+    if rims and isinstance(beyond, Sector):
+        raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
     span = drawn.span if axisymmetric else None
     conditions = edge_conditions(case.boundary, turn)

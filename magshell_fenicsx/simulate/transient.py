@@ -274,8 +274,8 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
 
     Loads are constant, except those whose conjugates are `held`.
 
-    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its drag is in proportion to the frequency of its third
-    mode of vibration: the first one has none at a fold.
+    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its drag is in proportion
+    to the frequency of its third mode of vibration: the first one has none there.
 
     Raises
     ------
