@@ -196,6 +196,7 @@ NAMES = {
     "edge",
     "over",
     "kind",
+    "then",
     "control",
     "errors",
     "until",
