@@ -52,12 +52,15 @@ class Departure:
         The bifurcation, as a point of that path; its direction is the mode, in lengths of the system.
     said
         What handing over has changed, in words; "" where the model is the same.
+    unstable
+        Number of unstable directions that the model excludes, without those that are neutral here.
     """
 
     stage: Stage
     path: Path
     point: Point
     said: str = ""
+    unstable: int = 0
 
     @property
     def scene(self) -> Scene:
@@ -67,9 +70,7 @@ class Departure:
         """The point in the model's own amplitudes and displacements."""
         found = self.stage.point(self.point)
         point = replace(found, state=self.scene.model.system.advance(found.state, found.state.mu))
-        unseen = self.scene.model.excluded_modes
-        counts = sum(unseen.counts(point.state)) if unseen else 0
-        of = {"branch": number, "excluded_pivots": counts, "said": self.said, "scene": self.scene}
+        of = {"branch": number, "excluded_pivots": self.unstable, "said": self.said, "scene": self.scene}
         return Record("step", self.path.name, point, **of)  # type: ignore[arg-type]
 
 
@@ -96,7 +97,9 @@ def departed(stage: Stage, found: Record, scale: float) -> Departure:
             phi = critical_mode(stage.newton, state).vector
         except NoEigenpair as e:
             raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
-        return Departure(stage, path, _at(path, state, phi, found.point.negative_pivots))
+        return Departure(
+            stage, path, _at(path, state, phi, found.point.negative_pivots), unstable=found.excluded_pivots
+        )
     new = larger(stage.scene, found.mode)
     other = stage.on(new)
     try:
@@ -109,7 +112,7 @@ def departed(stage: Stage, found: Record, scale: float) -> Departure:
     located = path.recorded(partial(_located, other, path, State(u, mu), phi))
     if isinstance(located, str):
         raise Stopped(f"the bifurcation ({found.mode}) is not found in the {new.problem.included[0]}: {located}")
-    departure = Departure(other, path, located)
+    departure = Departure(other, path, located, unstable=found.excluded_pivots)
     return replace(departure, said=_differences(stage.scene, found, departure))
 
 
