@@ -33,10 +33,11 @@ TUBE = {
     "boundary": {"bottom": "clamped", "top": "clamped"},
     "loading": FOLLOWED,
 }
+FINER, COARSER = {"mesh": {"refinement": 1.5}}, {"mesh": {"size": 0.1}}
 WAVES = {  # of h/1000 at most on these shells: the real part of (x + i y)^m
-    "cap": (CAP, 5, "0.03*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
+    "cap": (CAP | FINER, 5, "0.03*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
     "tube": (
-        TUBE,
+        TUBE | COARSER,
         9,
         "0.001*sin(pi*z)*(x**9 - 36*x**7*y**2 + 126*x**5*y**4 - 84*x**3*y**6 + 9*x*y**8)",
     ),
