@@ -61,9 +61,9 @@ def _whole(scene: Scene, state: State) -> tuple[Array, Array]:
 def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
     """Of shells of their own meshes, with an imperfection of h/1000 in the mode's waves, at the same volumes.
 
-    They carry the same pressure to 1e-3 at three amplitudes, and have as many unstable directions. They are halves, whose
-    plane holds the waves where they are: a whole shell may turn them about e3 almost without a force. Their own count of
-    antisymmetric modes has this one or not.
+    They carry the same pressure to 1e-3 at three amplitudes, and have as many unstable directions. They are halves,
+    whose plane holds the waves where they are: a whole shell may turn them about e3 almost without a force. Their own
+    count of antisymmetric modes has this one or not.
     """
     case, m, waves = WAVES[name]
     records = list(follow(Scene(problem_of(case)), remark=lambda said: None))
