@@ -69,12 +69,17 @@ def row(file: Path) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode."""
+    """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode.
+
+    Where the branch that begins there is followed, that is the shell.
+    """
     if not (folder / "path.csv").exists():
         return []
     rows = read_rows(folder / "path.csv")
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
+    if any(row["label"] == "bifurcation" and row["mode"].startswith("m = ") for row in rows[:-1]):
+        return ["shell.png"]
     return ["instabilities.png"] if any(row["label"] == "bifurcation" for row in rows) else []
 
 

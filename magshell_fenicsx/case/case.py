@@ -38,6 +38,8 @@ from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
+Waves = Annotated[int, Field(ge=1, le=200)]
+
 
 def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
     """See that a shell has the patches of a key; a mesh file knows its own later.
@@ -106,10 +108,11 @@ class Case(WithParts):
     """How pictures look"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
-    symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
+    symmetry: Literal["auto", "none", "half", "axisymmetric"] | Waves = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
     that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge
-    (axisymmetric)"""
+    (axisymmetric), or for a number m the sector of 180/m degrees between two mirror planes through e3, which waves
+    cos(mφ) have; 1 is a half"""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -167,8 +170,8 @@ class Case(WithParts):
         if isinstance(self.thickness_factor, dict | GivenField):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         self.mesh.refuse_unfit_solid(read=read)
-        if self.symmetry == "axisymmetric":
-            raise ValueError("symmetry: axisymmetric: a solid is whole or half")
+        if self.symmetry not in ("auto", "none", "half"):
+            raise ValueError(f"symmetry: {self.symmetry}: a solid is whole or half")
         if self.solid:
             self.solid.refuse_unfit(self.shell.poisson_ratio)
         return self

@@ -12,9 +12,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import changed, perfect_case
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grading import Grading, Squares
+from magshell_fenicsx.mesh.grading import Disc, Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
-from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror, rotation
+from magshell_fenicsx.mesh.mirror import Y0, Mirror, Sector, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
@@ -48,10 +48,11 @@ from magshell_fenicsx.problem.sizes import Loaded, grading
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, unmirrored
+from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, sector, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
 FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
 
@@ -93,7 +94,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
-        turn, beyond = plane.azimuth, Y0
+        turn, beyond = plane.azimuth, Sector.at(0.0, plane.waves) if isinstance(plane, Sector) else Y0
     points = _named_points(case, drawn, turn, half)
     under = dict[str, str]()
     for name, (step, place) in places.items():
@@ -120,25 +121,30 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         varying = [each.finer(case.mesh.refinement) for each in varying]
     size = grading(context, drawn, material.h, [*local, *touched], everywhere, loaded, varying, local=bool(local))
     drawn = imperfect(perfect, found, turn, still)
+    if isinstance(beyond, Sector):
+        size = towards_tip(size, beyond)
     shape = drawn.chart(beyond, size)
-    if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
+    if isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     rims = different(local)
+    if rims and isinstance(beyond, Sector):
+        raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
     span = drawn.span if axisymmetric else None
     conditions = edge_conditions(case.boundary, turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
-        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
+        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost}
+        conditions |= dict.fromkeys(beyond.sides, "symmetry")
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
     all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
-    model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
+    model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"
     included, left_out = account(context, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     sample = sample if len(sample) else drawn.sample()
@@ -152,6 +158,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         meridian=span,
         mirror=beyond,
         azimuth=turn,
+        turns=askew(parts) is None,
         shape=shape,
         embedding=drawn.embedding,
         points=points,
@@ -281,6 +288,19 @@ def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Ch
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
+def part_of(plane: Mirror | None) -> str:
+    """What of the shell is modelled, in words."""
+    if isinstance(plane, Sector):
+        return f"sector of {180 / plane.waves:.4g} degrees of the"
+    return "half" if plane else "full"
+
+
+def towards_tip(size: Grading, sector: Sector) -> Grading:
+    """Sizes at most as large as a sector is wide, so that triangles are not thin beside the axis of a disc."""
+    tip = Disc((0.0, 0.0), 0.0, SHORTEST * size.largest, sector.angle)
+    return replace(size, features=[*size.features, tip])
+
+
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
     """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
     reason = askew(parts)
@@ -288,6 +308,14 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         raise CaseError(f"symmetry: axisymmetric: {reason}")
     if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
         return True, None
+    if isinstance(case.symmetry, int):
+        places = [np.array(x) for x in case.points.values()]
+        if found := sector(parts, drawn, case.symmetry, places):
+            return False, found
+        raise CaseError(
+            f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
+            f"angle of {180 / case.symmetry:g} degrees with all named points between them"
+        )
     if case.symmetry not in ("auto", "half"):
         return False, None
     plane = mirror(parts, drawn, loosely=case.symmetry == "half")

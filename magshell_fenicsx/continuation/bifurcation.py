@@ -31,6 +31,7 @@ NEAR = 1e-5  # in lengths: after a longer step the state is brought back into eq
 DIFFERENCE = 1e-4  # relative, of an amplitude
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in lengths of the system
+SMALLER = 0.2, 0.08, 0.03  # if the first of these fails, as where the tangent is nearly singular in another direction
 SEEN = 1e-4  # a larger relative change of the amplitude is no rounding error
 ODD = 0.1  # a branch is asymmetric if the changes of the amplitude in both directions differ by more than this part
 
@@ -199,14 +200,19 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
         return None
     mode = np.asarray(mode * path.system.length / largest(path.system.comm, mode))
     branching_point = None
-    for size in SIZES:
+    sizes = list(SIZES)
+    while sizes:
+        size = sizes.pop(0)
         starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
         if starts[0] is None or starts[1] is None:
-            return branching_point
+            if branching_point:
+                break
+            sizes = [smaller for smaller in SMALLER if smaller < size]
+            continue
         rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
         symmetric = abs(rises[0] - rises[1]) <= ODD * abs(rises[0] + rises[1])
         branching_point = Branching(symmetric, (starts[0], starts[1]))
-        if max(map(abs, rises)) > SEEN * abs(state.mu[name]):
+        if size < SIZES[0] or max(map(abs, rises)) > SEEN * abs(state.mu[name]):
             break
     return branching_point
 

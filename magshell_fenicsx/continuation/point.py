@@ -87,6 +87,9 @@ class Journal(Protocol):
     def record(self, found: Point | str) -> None:
         """Keep a result. Collective."""
 
+    def begin(self, space: object) -> None:
+        """The results from here on are of another system, with the unknowns of that space. Collective."""
+
     def check(self, known: bool) -> None:
         """Between two steps in time towards one result, which may be `known` already. Collective.
 
@@ -101,6 +104,9 @@ class NoJournal:
         return None
 
     def record(self, found: Point | str) -> None:
+        pass
+
+    def begin(self, space: object) -> None:
         pass
 
     def check(self, known: bool) -> None:

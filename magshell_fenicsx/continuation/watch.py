@@ -103,7 +103,8 @@ class Excluded(Protocol):
     """All modes that a model excludes."""
 
     @property
-    def families(self) -> Sequence[Family]: ...
+    def families(self) -> Sequence[Family]:
+        """Those whose crossings are located: the first ones of `counts`, or none."""
 
     def counts(self, state: State) -> Sequence[int]:
         """Numbers of unstable directions of all families at a state of the model."""
@@ -254,14 +255,14 @@ class Watch:
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
         """The families that are unstable at the first point, and were not so on the path before."""
-        for family, count, before in zip(self._families, look.counts, self._before, strict=True):
+        for family, count, before in zip(self._families, look.counts, self._before, strict=False):
             if count and count != before:
                 yield Crossing(family.label, look.point, sum(look.counts))
 
     def _between(self, low: _Look, high: _Look) -> list[Crossing]:
         """The crossings between two points, in the order of the path."""
         step, located = Step(self._path, low.point, high.point), list[tuple[float, str, Point, int]]()
-        for family, before, after in zip(self._families, low.counts, high.counts, strict=True):
+        for family, before, after in zip(self._families, low.counts, high.counts, strict=False):
             change = Change(_Expanded(family, self._expand), before, after)
             try:
                 located += [(step.place(p), family.label, p, rise) for p, rise in step.crossings(change)]
@@ -275,7 +276,7 @@ class Watch:
 
     def _look(self, point: Point, along: float) -> _Look:
         state = self._expand(point.state)
-        if self._excluded is None or len(self._families) > 1:
+        if self._excluded is None or len(self._families) != 1:
             return _Look(point, along, tuple(self._excluded.counts(state)) if self._excluded else ())
         factors = self._families[0].factor_at(state)
         softest, vector = _softest(factors, self._looked.vector if self._looked else None)

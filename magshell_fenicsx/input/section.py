@@ -198,6 +198,7 @@ NAMES = {
     "edge",
     "over",
     "kind",
+    "then",
     "control",
     "errors",
     "until",

@@ -111,6 +111,11 @@ class Midsurface:
         return function
 
     @property
+    def patch(self) -> PatchMesh:
+        """The triangulation, whole on every rank."""
+        return self._patch
+
+    @property
     def read(self) -> bool:
         """Whether it comes from a mesh file, and so may have facets or folds."""
         return self._patch.nodes.shape[1] != 2

@@ -18,6 +18,7 @@ def rotation(azimuth: float) -> NDArray[np.float64]:
 Array = NDArray[np.float64]
 CUT = "symmetry"  # name of the edge on the plane
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
+SECOND_CUT = "symmetry 2"  # of that on the second plane of a sector
 ROUNDING = 1e-9
 
 
@@ -74,6 +75,29 @@ class Mirror:
         """The normal, and the offset if it is not zero: (3,) or (4,)."""
         return np.append(self.normal, self.offset) if self.offset else self.normal
 
+    @property
+    def sides(self) -> Mapping[str, "Mirror"]:
+        """Name of each edge on a plane -> the plane."""
+        return {CUT: self}
+
+    @property
+    def copies(self) -> int:
+        """How many copies of what is modelled make the whole."""
+        return 2
+
+    @property
+    def images(self) -> list["Image"]:
+        """The copies that make the whole; the first is what is modelled itself."""
+        return [Image(np.eye(3), np.zeros(3), 1.0), Image(self.reflection, 2 * self.offset * self.normal, -1.0)]
+
+    def everywhere(self, x: Array) -> Array:
+        """Places (n, 3) and all their images, (copies n, 3)."""
+        return np.concatenate([image.of(x) for image in self.images])
+
+    def summed(self, v: Array, parity: float = 1.0) -> Array:
+        """The sum (3,) of the images of a vector; mirrored ones count `parity` times."""
+        return np.asarray(sum(image.Q @ v * (parity if image.sign < 0 else 1.0) for image in self.images))
+
     def turned(self, azimuth: float) -> "Mirror":
         """This plane, given in a frame turned about e3 by an azimuth (rad), in the frame that is not turned."""
         return replace(self, normal=self.normal @ rotation(azimuth))
@@ -90,7 +114,7 @@ class Mirror:
 
     def image(self, x: Array) -> Array:
         """Mirrored places (..., 3)."""
-        return np.asarray(x - 2 * self.beyond(x)[..., None] * self.normal)
+        return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
 
     def beyond(self, x: Array) -> Array:
         """Distances (...) from the plane, positive in the half that is modelled."""
@@ -107,6 +131,72 @@ class Mirror:
         along = np.cross(first, self.normal)
         along /= np.linalg.norm(along)
         return along, np.asarray(np.cross(self.normal, along))
+
+
+@dataclass(frozen=True)
+class Image:
+    """A copy of what is modelled, x -> Q x + shift; `sign` is the determinant of Q."""
+
+    Q: Array
+    shift: Array
+    sign: float
+
+    def of(self, x: Array) -> Array:
+        """The images (..., 3) of places."""
+        return np.asarray(x @ self.Q.T + self.shift)
+
+    def back(self, x: Array) -> Array:
+        """The places (..., 3) whose images these are."""
+        return np.asarray((x - self.shift) @ self.Q)
+
+
+@dataclass(frozen=True, eq=False)
+class Sector(Mirror):
+    """Two planes through e3, this one and one that is turned by 180/m degrees; what lies between them is modelled.
+
+    Waves cos(m theta) around e3 have both as planes of symmetry. A half is the sector of m = 1.
+
+    Attributes
+    ----------
+    waves
+        m, at least 1.
+    """
+
+    waves: int = 2
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sector) and self.waves == other.waves and super().__eq__(other)
+
+    def __hash__(self) -> int:
+        return hash((super().__hash__(), self.waves))
+
+    @classmethod
+    def at(cls, azimuth: float, waves: int) -> "Sector":
+        """The sector that begins at an azimuth (rad)."""
+        return cls(Mirror.upright(azimuth).normal, waves=waves)
+
+    @property
+    def angle(self) -> float:
+        """Between the planes (rad)."""
+        return np.pi / self.waves
+
+    @property
+    def second(self) -> Mirror:
+        """The plane where it ends."""
+        return Mirror.upright(self.azimuth + self.angle).reversed
+
+    @property
+    def sides(self) -> Mapping[str, Mirror]:
+        return {CUT: self, SECOND_CUT: self.second}
+
+    @property
+    def copies(self) -> int:
+        return 2 * self.waves
+
+    @property
+    def images(self) -> list[Image]:
+        turns = [rotation(-2 * self.angle * k) for k in range(self.waves)]
+        return [Image(Q @ one.Q, Q @ one.shift, one.sign) for Q in turns for one in super().images]
 
 
 Y0 = Mirror(

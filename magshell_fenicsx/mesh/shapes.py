@@ -51,6 +51,8 @@ class Shape(Protocol):
 class DiscShape:
     """A disc around the origin; edges `edge`, and "symmetry" of the half with y >= 0.
 
+    A sector has "symmetry" along the positive first axis and "symmetry 2" at its other end.
+
     Attributes
     ----------
     circles
@@ -59,6 +61,8 @@ class DiscShape:
         Other closed curves that they follow, points (n, 2) each; parts beyond the edge are left out.
     edge
         Name of its outer edge.
+    waves
+        m of the sector of 180/m degrees that is left of a half; 1 for all of it.
     """
 
     radius: float
@@ -66,11 +70,12 @@ class DiscShape:
     circles: tuple[float, ...] = ()
     edge: str = "rim"
     rims: tuple[Array, ...] = ()
+    waves: int = 1
     glued: ClassVar[tuple[Glued, ...]] = ()
 
     @property
     def area(self) -> float:
-        return pi * self.radius**2 / (2 if self.half else 1)
+        return pi * self.radius**2 / (2 * self.waves if self.half else 1)
 
     @property
     def reach(self) -> float:
@@ -78,20 +83,38 @@ class DiscShape:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        return np.zeros(2), np.array([self.radius, pi if self.half else 2 * pi])
+        return np.zeros(2), np.array([self.radius, pi / self.waves if self.half else 2 * pi])
 
     def faces(self, occ: Any) -> Faces:
         discs = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
         discs += within(occ, self.rims, lambda: (2, occ.addDisk(0, 0, 0, self.radius, self.radius)))
         if not self.half:
             return discs
+        if self.waves > 1:
+            return list(occ.intersect(discs, [self._wedge(occ)])[0])
         above = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
         return list(occ.intersect(discs, [above])[0])
+
+    def _wedge(self, occ: Any) -> tuple[int, int]:
+        """The triangle between the two sides of the sector, larger than the disc."""
+        side = 2 * self.radius / np.cos(pi / (2 * self.waves))
+        ends = [side * self._along, np.array([side, 0.0])]
+        corners = [occ.addPoint(*x, 0) for x in (np.zeros(2), ends[1], ends[0])]
+        lines = [occ.addLine(corners[i], corners[(i + 1) % 3]) for i in range(3)]
+        return 2, occ.addPlaneSurface([occ.addCurveLoop(lines)])
+
+    @property
+    def _along(self) -> Array:
+        """The direction of the second side."""
+        return np.array([np.cos(pi / self.waves), np.sin(pi / self.waves)])
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
         edges = {self.edge: np.isclose(np.hypot(x[:, 0], x[:, 1]), self.radius, rtol=1e-9)}
         if self.half:
             edges["symmetry"] = np.abs(x[:, 1]) < 1e-9 * self.radius
+        if self.half and self.waves > 1:
+            across = x @ np.array([-self._along[1], self._along[0]])
+            edges["symmetry 2"] = np.abs(across) < 1e-9 * self.radius
         return edges
 
 

@@ -132,6 +132,11 @@ class Step(Section):
         return 0
 
     @property
+    def follows_branch(self) -> bool:
+        """Whether it goes on along the branch at the bifurcation that ends it."""
+        return False
+
+    @property
     def wants_sensitivities(self) -> bool:
         """Whether the load at its fold is derived by what is given."""
         return False
@@ -302,14 +307,19 @@ class PathStep(Step):
     control: str
     until: Until
     points: Count = 10
-    then: Literal["snap"] | None = None
-    """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
-    loads and what else is held, lightly damped, until it rests on the branch that it snaps to; the next step goes on
-    from there"""
+    then: Literal["snap", "follow"] | None = None
+    """What follows the instability that ends the step. `snap`, with `until: limit` or `bifurcation`: the shell is
+    released, and moves under its loads and what else is held, lightly damped, until it rests on the branch that it
+    snaps to. `follow`, with `until: bifurcation`: the branch that begins there is followed, to a target that may stand
+    here, or for `points` steps. A mode that a meridian or a half excludes takes the smallest model that has it: for
+    m waves the sector of 180/m degrees between two mirror planes, else a half, else the whole shell. The next step
+    goes on from there, in that model"""
     snap: SnapSection = SnapSection.model_construct()
     """How it is released"""
     branches: bool = False
-    """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
+    """Follow the branch at the first bifurcation too, to the target or for `points` steps: both directions of one
+    that the model has itself; of a mode that it excludes one, in the smallest model that has it, and the other is the
+    same shape, turned or mirrored"""
     sensitivities: bool = False
     """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
 
@@ -337,14 +347,19 @@ class PathStep(Step):
                 f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
                 f"takes {' or '.join(self.targets)}"
             )
-        if self.until in ("limit", "bifurcation", "zero") and given:
+        onward = self.until == "bifurcation" and self.then == "follow"
+        if onward and len(given) > 1:
+            raise ValueError(f"{' and '.join(given)}: a branch has one target")
+        if self.until in ("limit", "bifurcation", "zero") and given and not onward:
             raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
         if self.until in ("points", "zero") and by != "arc":
             why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
-        if self.then and self.until != "limit":
-            raise ValueError("then: snap: goes with until: limit")
-        if self.snap != SnapSection() and not self.then:
+        if self.then == "snap" and self.until not in ("limit", "bifurcation"):
+            raise ValueError("then: snap: goes with until: limit or until: bifurcation")
+        if self.then == "follow" and self.until != "bifurcation":
+            raise ValueError("then: follow: goes with until: bifurcation")
+        if self.snap != SnapSection() and self.then != "snap":
             raise ValueError("snap: goes with then: snap")
         return self
 
@@ -362,7 +377,11 @@ class PathStep(Step):
 
     @property
     def released_by(self) -> SnapSection | None:
-        return self.snap if self.then else None
+        return self.snap if self.then == "snap" else None
+
+    @property
+    def follows_branch(self) -> bool:
+        return self.then == "follow"
 
     @property
     def _given(self) -> dict[str, float]:

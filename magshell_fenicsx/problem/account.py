@@ -3,7 +3,7 @@
 from collections import Counter
 from math import degrees
 
-from magshell_fenicsx.mesh.mirror import Mirror, plane_text
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, plane_text
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
 from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
@@ -48,7 +48,13 @@ def account(
             left_out.append(part.absent)
     if model == "meridian":
         left_out.append("waves around the axis (they are looked for at each point)")
-    if mirror:
+    if isinstance(mirror, Sector):
+        begin = degrees(mirror.azimuth) + 0.0
+        left_out.append(
+            f"the other {mirror.copies - 1} sectors: mirror planes through e3 at azimuths {begin:.5g} and "
+            f"{begin + degrees(mirror.angle):.5g} degrees (modes that they exclude are counted, not located)"
+        )
+    elif mirror:
         plane = (
             f"through e3 at azimuth {degrees(mirror.azimuth) + 0.0:g} degrees"
             if mirror.through_e3

@@ -13,11 +13,12 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
 from magshell_fenicsx.mesh.hexahedra import MIDDLE
-from magshell_fenicsx.mesh.mirror import Mirror, cut
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
-from magshell_fenicsx.mesh.shapes import Shape
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.mesh.unfolding import doubled
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import Inside
@@ -133,7 +134,9 @@ class Problem:
     meridian
         What is modelled instead of the surface; None if that is modelled.
     mirror
-        Plane of the half that is modelled; None for all.
+        Plane of the half, or both planes of the sector, that is modelled; None for all.
+    turns
+        Whether all parts are axisymmetric, whatever is modelled.
     azimuth
         The model's frame is turned about e3 by it (rad).
     shape, size, points, embedding
@@ -184,6 +187,7 @@ class Problem:
     size: Size
     included: list[str]
     left_out: list[str]
+    turns: bool = False
     thickness: Thickness | None = None
     length: float = 1.0
     pressed: tuple[tuple[float, float], ...] = ()
@@ -273,6 +277,16 @@ class Problem:
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         return patch
 
+    def _triangulated(self, shape: Shape) -> PatchMesh:
+        """A shape by gmsh: a sector from one half of it, whose mesh then tells no crests of waves from troughs."""
+        if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
+            return triangulate(shape, self.size, self.points, self.embedding)
+        middle = Mirror.upright(self.mirror.angle / 2)
+        at = {name: np.append(x, 0.0) for name, x in self.points.items()}
+        points = {name: (x if middle.beyond(x) <= 0 else middle.image(x))[:2] for name, x in at.items()}
+        half = triangulate(replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding)
+        return replace(doubled(half, self.mirror.angle), points=dict(self.points))
+
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
             return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
@@ -281,8 +295,9 @@ class Problem:
         if isinstance(self.shape, Grid):
             patch = grid_mesh(self.shape, self.points, self.embedding)
         else:
-            patch = triangulate(self.shape, self.size, self.points, self.embedding)
+            patch = self._triangulated(self.shape)
         whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
+        whole = whole and not isinstance(self.mirror, Sector)  # whose chart is narrower
         return cut(patch, self.mirror) if self.mirror and whole else patch
 
 

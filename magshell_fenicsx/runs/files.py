@@ -16,9 +16,10 @@ from mpi4py import MPI
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, solids
-from magshell_fenicsx.output.fields.surface import turned
+from magshell_fenicsx.output.fields.surface import turned, whole
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import plain, read_run, verdict
 from magshell_fenicsx.output.store import checkpoint
@@ -230,7 +231,9 @@ class RunFiles:
         self._begun_with = {key: value for key, value in begun.items() if key not in ("case", "version")}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         problem = self._scene.problem
-        mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror else None
+        halved = problem.mirror and not isinstance(problem.mirror, Sector)  # of which ParaView has one half
+        mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror and halved else None
+        self._of_whole = mirror is None
         about = About(problem.material.h, problem.material.nu, mirror, given(problem.context.shell).R)
         drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
         moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)
@@ -239,7 +242,7 @@ class RunFiles:
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept
 
-    def write(self, row: Row, state: State) -> None:
+    def write(self, row: Row, state: State, scene: Scene) -> None:
         """Write a point, unless an interrupted run has written it.
 
         Raises
@@ -252,15 +255,18 @@ class RunFiles:
             _same(row, self._rows[number])
         if number < self.kept:
             return
-        surface = self._gatherer.gather(state.u, state.mu)
+        if scene is not self._scene:
+            self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
+        surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
 
         def write() -> None:
             assert surface is not None
-            problem = self._scene.problem
+            problem = scene.problem
             beside = problem.loads, state.mu, problem.material.h
-            whole = replace(surface, outlines=outlines(*beside), solids=solids(*beside))
+            every = whole(surface, mirror) if mirror and (isinstance(mirror, Sector) or self._of_whole) else surface
+            drawn = replace(every, outlines=outlines(*beside), solids=solids(*beside))
             self._table.write(row)
-            self._fields.write(number, turned(whole, problem.azimuth), row)
+            self._fields.write(number, turned(drawn, problem.azimuth), row)
 
         by_first(self._comm, write)
 

@@ -15,7 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
 from magshell_fenicsx.output.fields.modes import columns_of, gradient_file
-from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.fields.surface import Surface, turned, whole
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
@@ -137,9 +137,9 @@ def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) 
     if base is None:
         return None
     surface = replace(base, fields={name: v for name, v in drawn.items() if v is not None})
-    if model.multiplicity == 2:
+    if model.multiplicity > 1:
         assert not model.axisymmetric
-        surface = completed(surface, model.mirror.plane)
+        surface = whole(surface, model.mirror)
     return turned(surface, scene.problem.azimuth)
 
 

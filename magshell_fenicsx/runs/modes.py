@@ -1,7 +1,7 @@
 """After a run: null vectors at the instabilities, the modes that the case requests, natural frequencies."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from math import isnan, nan
 from pathlib import Path
@@ -48,13 +48,12 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
     DiskError
         On every rank, if something cannot be written.
     """
-    scene, wanted = result.scene, result.scene.problem.stability
+    wanted = result.scene.problem.stability
     if result.singular or wanted:
-        writer = _Writer(result, folder, say, gatherer(scene.model, scene.comm))
-        shell = ShellModes(scene.model)
-        writer.null_vectors(shell)
+        writer = _Writer(result, folder, say)
+        writer.null_vectors()
         if wanted:
-            writer.modes(shell, wanted)
+            writer.modes(wanted)
 
 
 @dataclass(frozen=True)
@@ -62,33 +61,40 @@ class _Writer:
     result: Result
     folder: Path
     say: Say
-    gatherer: Gatherer
+    _known: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
 
-    def null_vectors(self, shell: ShellModes) -> None:
+    def _of(self, number: int) -> tuple[ShellModes, Gatherer]:
+        """The modes of the model of a point, and what gathers them."""
+        scene = self.result.scene_of(number)
+        if id(scene) not in self._known:
+            self._known[id(scene)] = ShellModes(scene.model), gatherer(scene.model, scene.comm)
+        return self._known[id(scene)]
+
+    def null_vectors(self) -> None:
         for number, state in self.result.singular.items():
-            row = self.result.rows[number]
+            row, scene = self.result.rows[number], self.result.scene_of(number)
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
             try:
-                vector = shell.null_vector(state, label)
+                vector = self._of(number)[0].null_vector(state, label)
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
             surface = self._write(number, str(row["label"]), state, label, vector)
-            if surface is not None and self.result.scene.problem.meridian is None:
+            if surface is not None and scene.problem.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
                 exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
-                self.result.largest[number] = [float(x) for x in exact * self.result.scene.problem.length]
+                self.result.largest[number] = [float(x) for x in exact * scene.problem.length]
             if surface is not None and not label and (m := wave_number(surface)):
                 self.say(f"the null vector at point {number} has {m} waves around e3")
 
-    def modes(self, shell: ShellModes, wanted: StabilitySection) -> None:
+    def modes(self, wanted: StabilitySection) -> None:
         points = self.result.singular
         if wanted.at == "end":
             points = {self.result.end: self.result.last}
         by_point: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
             try:
-                lowest = shell.lowest(state, wanted.modes)
+                lowest = self._of(number)[0].lowest(state, wanted.modes)
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
                 by_point[number] = lowest[: max(wanted.modes, unstable)]
             except ModesNotFound as e:
@@ -102,7 +108,7 @@ class _Writer:
 
     def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
         file = mode_file(self.folder, number, name, label)
-        return write_mode_of(self.result.scene, self.gatherer, file, state, label, vector)
+        return write_mode_of(self.result.scene_of(number), self._of(number)[1], file, state, label, vector)
 
 
 def write_mode_of(
@@ -129,7 +135,7 @@ def own_wave(scene: Scene) -> str:
     """The wave of the model's own modes."""
     if scene.model.axisymmetric:
         return "0"
-    return "symmetric" if scene.model.multiplicity == 2 else ""
+    return "symmetric" if scene.model.multiplicity > 1 else ""
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
@@ -170,7 +176,7 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
     DiskError
         On every rank, if something cannot be written.
     """
-    scene, section = result.scene, result.scene.problem.frequencies
+    section, scene = result.scene.problem.frequencies, result.scene
     if section is None:
         return
     if scene.model.without_potential and scene.problem.loads.pressure:
@@ -181,8 +187,10 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         states = {**start, result.end: result.last}
     elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
         say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
-    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.problem.time_unit
+    own, unit, of = own_wave(scene), scene.problem.time_unit, dict[int, ShellModes]()
     for number, state in states.items():
+        scene = result.scene_of(number)
+        shell = of.setdefault(id(scene), ShellModes(scene.model))
         state = rigid(scene, state)
         try:
             result.frequencies[number] = modes = shell.vibrations(state, section.count)
@@ -200,8 +208,9 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
-    gathering = gatherer(scene.model, scene.comm)
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
+        scene = result.scene_of(number)
+        gathering = gatherer(scene.model, scene.comm)
         for n, mode in enumerate(result.frequencies[number][: section.count], 1):
             file = mode_file(folder, number, f"f{n}", mode.label)
             write_mode_of(scene, gathering, file, states[number], mode.label, mode.vector)

@@ -13,7 +13,7 @@ from subprocess import DEVNULL, PIPE, Popen
 from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.fields.surface import Surface, turned, whole
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
@@ -42,9 +42,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return (
-        turned(completed(found, problem.mirror.plane) if problem.mirror else found, problem.azimuth) if found else None
-    )
+    return turned(whole(found, problem.mirror) if problem.mirror else found, problem.azimuth) if found else None
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":

@@ -28,7 +28,8 @@ class RowMaker:
 
     def row(self, record: Record, wall_s: float) -> Row:
         """The next row; `wall_s` is in seconds since the start of the history. Collective."""
-        values, point = self._scene.observe(record.point.state), record.point
+        scene = record.scene or self._scene
+        values, point = scene.observe(record.point.state), record.point
         if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
             self._field_end = values["w_over_h"]
         self._count += 1
@@ -61,7 +62,7 @@ class RowMaker:
             self._begun, self._step = dict(self._clock), record.step
         since = {name: record.clock.get(name, 0.0) for name in CLOCK}
         self._clock = {name: self._begun[name] + since[name] for name in CLOCK}
-        stored = self._scene.stored(record.point.state, values["energy"])
+        stored = (record.scene or self._scene).stored(record.point.state, values["energy"])
         own = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
         return {**self._clock, **own, "stored": stored}
 

@@ -124,6 +124,9 @@ class Stoppable:
     def record(self, found: Point | str) -> None:
         self._journal.record(found)
 
+    def begin(self, space: object) -> None:
+        self._journal.begin(space)
+
     def check(self, known: bool) -> None:
         self._watch.check(limited=not known)  # a way that is only computed again must end, or no resumed run gets on
 
@@ -273,6 +276,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
         return {}
     assert result.walked.located
     record = result.walked.located[-1]
+    scene = record.scene or scene
     try:
         fold = fold_at(scene, record)
     except FoldLost as e:
@@ -309,11 +313,13 @@ def _follow(
             result.latest, result.last, result.end = record, record.point.state, len(result.rows) - 1
         if wanted(scene.problem.frequencies, len(result.rows) - 1):
             result.kept[len(result.rows) - 1] = record.point.state
+        if record.scene and record.scene is not scene:
+            result.elsewhere[len(result.rows) - 1] = record.scene
         if record.label in LOCATED:
             result.singular[len(result.rows) - 1] = record.point.state
         if files:
             with result.output:
-                files.write(row, record.point.state)
+                files.write(row, record.point.state, record.scene or scene)
         replayed = files is not None and len(result.rows) <= files.kept
         progress.accepted(row, known=replayed)
         if not replayed:

@@ -94,6 +94,8 @@ class Result:
         length; on rank 0, and not of a meridian, whose modes have rings.
     latest
         The record of `last`; None before the first.
+    elsewhere
+        The scenes of the rows that have another than `scene`, as of a branch that its model excludes.
     """
 
     scene: Scene
@@ -116,6 +118,11 @@ class Result:
     gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
     largest: dict[int, list[float]] = field(default_factory=dict)
     latest: Record | None = None
+    elsewhere: dict[int, Scene] = field(default_factory=dict)
+
+    def scene_of(self, row: int) -> Scene:
+        """The scene of a row."""
+        return self.elsewhere.get(row, self.scene)
 
     @property
     def history(self) -> Table:
@@ -222,7 +229,11 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "barrier": result.barrier,
         "snaps": snapped,
         **({"snap_time_ms": 1e3 * snapped[0]["time"] * sizes.size("time")} if snapped and sizes.unit("time") else {}),
-        **{key: said for room in SEEN for key, said in room.summary(scene.sight, result.last).items()},
+        **{
+            key: said
+            for room in SEEN
+            for key, said in room.summary(result.scene_of(result.end).sight, result.last).items()
+        },
         "frequencies": [
             {
                 "point": number,
@@ -257,9 +268,9 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
 
 def solutions(result: Result) -> list[dict[str, Any]]:
     """What searches have found; the residual is over the sum of the sizes of all terms' forces. Collective."""
-    system, found = result.scene.model.system, []
+    found = []
     for number, state in result.found.items():
-        row = result.rows[number]
+        row, system = result.rows[number], result.scene_of(number).model.system
         residual = system.residual(state.u, state.mu)
         forces = (factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name) for t in system.terms)
         sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Capped, Profile, Revolved
@@ -219,7 +219,8 @@ def _disc(
     curvature: float = 1.0,
 ) -> Outline:
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
-        return DiscShape(edge, mirror is not None, edge=name)
+        waves = mirror.waves if isinstance(mirror, Sector) else 1
+        return DiscShape(edge, mirror is not None, edge=name, waves=waves)
 
     def within(x: Array) -> Array:
         chart = inverse(x)
@@ -278,6 +279,8 @@ def _grid(
     span: Span | None = None,
 ) -> Outline:
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        if isinstance(mirror, Sector):
+            return replace(_between(grid, mirror), size=size.across if size.features else size.largest)
         through = lines_on(mirror, grid, embedding) if mirror else grid.through
         return replace(grid, size=size.across if size.features else size.largest, through=through)
 
@@ -285,6 +288,21 @@ def _grid(
         return _either_half(grid_mirrors(grid, embedding))
 
     return Outline(chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
+
+
+def _between(grid: Grid, sector: Sector) -> Grid:
+    """The part of a grid that is closed around e3 from azimuth 0 to 180/m degrees, at least four quadrilaterals."""
+    end = (grid.high[0] - grid.low[0]) / sector.copies
+    parts = tuple(end * part for part in (0.25, 0.5, 0.75))
+    sides = (CUT, SECOND_CUT, *grid.sides[2:])
+    return replace(
+        grid,
+        low=(0.0, grid.low[1]),
+        high=(end, grid.high[1]),
+        sides=sides,
+        glued=(False, grid.glued[1]),
+        through=(parts, grid.through[1]),
+    )
 
 
 def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:

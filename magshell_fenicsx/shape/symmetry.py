@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, Sector
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.shape.turning import scalar_turns
 
@@ -97,6 +97,23 @@ def mirror(parts: Sequence[Leaves], outline: "Outline", *, loosely: bool = False
         return None
     chosen = first(upright) or first(outline.mirrors([unit(v) for v in vectors], False))
     return first(outline.mirrors([unit(v) for v in vectors], True)) if loosely and not chosen else chosen
+
+
+def sector(parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vectors = ()) -> Sector | None:
+    """The sector of 180/m degrees between two planes that all parts leave; None if there is none.
+
+    Parameters
+    ----------
+    places
+        Named places (3,), which may choose where it begins.
+    """
+    azimuth = common_azimuth([v for part in parts for v in part.vectors])
+    if not outline.round or azimuth is None:
+        return None
+    beside = [a for part in parts for a in part.azimuths] + [atan2(x[1], x[0]) for x in places if tilted(x)]
+    begins = [a + turn for a in (azimuth, *beside) for turn in (0.0, -pi / waves, pi)]
+    found = (Sector.at(begin, waves) for begin in begins)
+    return next((s for s in found if all(part.mirrors(side) for part in parts for side in s.sides.values())), None)
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:

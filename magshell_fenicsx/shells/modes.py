@@ -19,6 +19,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, thickness
 from magshell_fenicsx.shells.meridian import MeridianModel
 
@@ -145,7 +146,7 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
             yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
         for m in range(1, waves.largest + 1):
             yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass)
-    elif model.excluded_modes is not None:
+    elif isinstance(model.excluded_modes, AntisymmetricModes):
         yield of("antisymmetric", model.excluded_modes.system)
 
 

@@ -41,7 +41,7 @@ class Observed:
     system
         What the solvers see.
     multiplicity
-        2 for a half model, whose integrals and forces are those of one half; else 1.
+        Of how many such parts the shell is made: 2 for a half, 2 m for a sector of 180/m degrees, else 1.
     u, r0
         Displacement and placement.
     normals
@@ -99,7 +99,7 @@ class Observed:
 
     @property
     def mirrored_facets(self) -> Facets:
-        """The edges on the mirror plane of a half model; none of another."""
+        """The edges on the mirror planes of a half model or a sector; none of another."""
         return np.empty(0, dtype=np.int32)
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:

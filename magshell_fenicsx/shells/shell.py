@@ -20,7 +20,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
 from magshell_fenicsx.mesh.patch import Deviation, MeshError
 from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
@@ -56,6 +56,7 @@ from magshell_fenicsx.parts.supports.supports import (
 from magshell_fenicsx.parts.touching.building import touchings
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import EnergyFactory
+from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
 
 class ShellModel(Thin):
@@ -75,7 +76,7 @@ class ShellModel(Thin):
     thickness
         What multiplies the thickness; None for 1.
     mirror
-        The plane of the edge with the condition "symmetry", of a half model.
+        The plane of the edge with the condition "symmetry", of a half model; both of a sector.
 
     Raises
     ------
@@ -91,11 +92,14 @@ class ShellModel(Thin):
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
     mirror
-        Of a half model.
+        Of a half model or a sector.
+    turns
+        Whether what it is made of, and all that loads it, is axisymmetric; whoever makes the model may set it.
     """
 
     thin: Literal[True] = True
     axisymmetric: Literal[False] = False
+    turns: bool = False
     midsurface: Midsurface
 
     def __init__(
@@ -109,6 +113,7 @@ class ShellModel(Thin):
         thickness: Thickness | None = None,
         mirror: Mirror = Y0,
     ) -> None:
+        self._given = material, degree, conditions, loads, sigma, thickness
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         for name in ("magnetic", "remanence"):
             if field := getattr(loads, name):
@@ -117,7 +122,8 @@ class ShellModel(Thin):
                 loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
         self.midsurface, self.material, self.degree = midsurface, material, degree
         self.load_size = {}
-        self.multiplicity = 2 if "symmetry" in conditions.values() else 1
+        sides = {name: plane for name, plane in mirror.sides.items() if conditions.get(name) == "symmetry"}
+        self.multiplicity = mirror.copies if sides else 1
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
@@ -163,11 +169,13 @@ class ShellModel(Thin):
             ]
             return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
 
-        if "symmetry" in conditions.values():
-            planes.append(mirror)
-            self._mirror_term = factory.term(factory.mirror_edges(facets("symmetry"), mirror.normal))
+        for name, side in sides.items():
+            planes.append(side)
+            where = midsurface.edges[name]
+            edge = "mirror edges" if name == CUT else f"{name} mirror edges"
+            self._mirror_term = factory.term(factory.mirror_edges(where, side.normal, edge))
             terms.append(self._mirror_term)
-            mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
+            mirrored.append(held_along(V, 1, where, side.normal))
         clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
         self.supports: dict[str, Support] = {}
         on_planes: dict[str, Support] = {}
@@ -271,10 +279,12 @@ class ShellModel(Thin):
                 each.refuse_near()
 
     @cached_property
-    def excluded_modes(self) -> AntisymmetricModes | None:
-        """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
+    def excluded_modes(self) -> AntisymmetricModes | UnfoldedModes | None:
+        """The modes that a half model or a sector does not see; None for a whole one. Compiles kernels."""
         if self.multiplicity == 1:
             return None
+        if isinstance(self.mirror, Sector):
+            return UnfoldedModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
@@ -295,6 +305,12 @@ class ShellModel(Thin):
                 system.history,
             )
         )
+
+    def _as_half(self, midsurface: Midsurface) -> "ShellModel":
+        """The same shell on the mid-surface of a half."""
+        material, degree, conditions, loads, sigma, thickness = self._given
+        conditions = {name: c for name, c in conditions.items() if name != SECOND_CUT}
+        return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness)
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:

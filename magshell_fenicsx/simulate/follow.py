@@ -8,12 +8,13 @@ from magshell_fenicsx.continuation.path import SEEN, NotANumber
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.continuation.walk import Goal
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.stage import plain
-from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
+from magshell_fenicsx.simulate.steps import LOCATED, departure_of, followed_on, held_by, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
@@ -51,18 +52,18 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     try:
         _refuse_not_numbers(scene, state, "")
     except Stopped:
-        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0), shown=scene.displacement)
+        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0), scene=scene, shown=scene.displacement)
         raise
     pivots = scene.newton.factor_at(state).negative_pivots
     start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
-    yield Record("start", "", start, shown=scene.displacement)
+    yield Record("start", "", start, scene=scene, shown=scene.displacement)
     if pivots:
         raise Stopped(
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     for name, value in own.items():
         rise = Walked(_under(scene, name, value, state))
-        yield from (replace(risen, shown=scene.displacement) for risen in rise)
+        yield from (replace(risen, scene=scene, shown=scene.displacement) for risen in rise)
         state = rise.end
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
@@ -72,19 +73,30 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         try:
             for record in walked:
                 last = record.label
-                yield replace(record, step=step.number, shown=scene.displacement)
-                refuse_penetration(scene, record.point.state)
+                yield _told(scene, step, record, remark, where)
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
             release = step.load.released_by
-            if release and record:
+            if release and record and step.until == "bifurcation" and last == "bifurcation":
+                record = departure_of(scene, step, record).record(0)
+                scene = record.scene or scene
+                yield _told(scene, step, record, remark, where)
+            elif release and record:
+                if record.label != "fold" or record.mode:
+                    at = record.mode or record.label
+                    raise Stopped(f"then: snap: the step ends at a {at}, not at a fold of the model itself")
                 if record.excluded_pivots:
                     remark(where + _buckled(scene, record, first))
-                walked = Walked(released(scene, release, record, held_by(scene, step, record.point.state)))
+            further = None
+            if release and record:
+                further = released(scene, release, record, held_by(scene, step, record.point.state))
+            elif step.load.follows_branch and record and last == "bifurcation":
+                further = followed_on(scene, step, record)
+            if further:
+                walked = Walked(further)
                 for record in walked:
-                    last = record.label
-                    yield replace(record, step=step.number, shown=scene.displacement)
-                    refuse_penetration(scene, record.point.state)
+                    last, scene = record.label, record.scene or scene
+                    yield _told(scene, step, record, remark, where)
         except (Stopped, NotANumber) as e:
             names = scene.model.system.strange
             strange = f"; where it was tried last, {' and '.join(names)} was not a number" if names else ""
@@ -94,9 +106,18 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             return
         begin, state = state, walked.end
         for record in searched(scene, step, begin, state) if search else ():
-            yield replace(record, step=step.number, shown=scene.displacement)
+            yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
+
+
+def _told(scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str) -> Record:
+    """A record as a history gives it."""
+    at = record.scene or scene
+    if record.said:
+        remark(where + record.said)
+    refuse_penetration(at, record.point.state)
+    return replace(record, step=step.number, scene=at, shown=at.displacement)
 
 
 def pulling(scene: Scene, state: State) -> dict[str, float]:

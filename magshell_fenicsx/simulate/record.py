@@ -10,6 +10,8 @@ from magshell_fenicsx.continuation.system import State
 if TYPE_CHECKING:
     from dolfinx import fem
 
+    from magshell_fenicsx.simulate.scene import Scene
+
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
 
 
@@ -43,6 +45,10 @@ class Record:
         False at the end of a `trace` that has not come to its last target.
     shown
         What makes `u`.
+    scene
+        Of the point: another than that of a run's begin where a mode has led out of its model.
+    said
+        What the point must not be read without, in a sentence.
     """
 
     label: Label
@@ -55,6 +61,8 @@ class Record:
     clock: Mapping[str, float] = field(default_factory=dict)
     reached: bool = True
     shown: "Callable[[State], fem.Function] | None" = field(default=None, compare=False, repr=False)
+    scene: "Scene | None" = field(default=None, compare=False, repr=False)
+    said: str = ""
 
     @property
     def u(self) -> "fem.Function":

@@ -47,9 +47,9 @@ Array = NDArray[np.float64]
 
 
 def build_model(problem: Problem, comm: MPI.Comm) -> ShellModel:
-    """The whole shell or half of it, on all ranks together."""
+    """The whole shell, half of it or a sector, on all ranks together."""
     surface = build_midsurface(problem, comm)
-    return ShellModel(
+    model = ShellModel(
         surface,
         problem.material,
         problem.mesh.degree,
@@ -59,6 +59,8 @@ def build_model(problem: Problem, comm: MPI.Comm) -> ShellModel:
         problem.thickness,
         problem.mirror or Y0,
     )
+    model.turns = problem.turns
+    return model
 
 
 def build_meridian_model(problem: Problem) -> MeridianModel:

@@ -77,10 +77,10 @@ def _plane(scene: Scene, x: Array) -> tuple[Array, float]:
 
 
 def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
-    """The mean (3,) and the covariance (3, 3) of places of all ranks, of a half model with their mirror images."""
+    """The mean (3,) and the covariance (3, 3) of places of all ranks, of a part of a shell with their images."""
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
-        x = np.vstack([x, x - 2 * np.outer(x @ mirror.normal - mirror.offset, mirror.normal)])
+        x = mirror.everywhere(x)
     count = max(comm.allreduce(len(x)), 1)
     mean = comm.allreduce(x.sum(axis=0)) / count
     return mean, comm.allreduce((x - mean).T @ (x - mean)) / count

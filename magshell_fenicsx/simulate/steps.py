@@ -10,12 +10,14 @@ from magshell_fenicsx.parts.bodies.press import finer as along_contact
 from magshell_fenicsx.parts.course import Drive, Gas, GasSection, Here
 from magshell_fenicsx.parts.pressure.pressure import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.quantities.registry import OWN_MODES
+from magshell_fenicsx.simulate.handover import Departure, departed, leaving
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
 from magshell_fenicsx.simulate.touch import touched
 from magshell_fenicsx.simulate.transient import motion
-from magshell_fenicsx.simulate.walked import Records, Walked, followed
+from magshell_fenicsx.simulate.walked import Records, Walked, followed, off_path
 
 LOCATED = ("fold", "bifurcation")
 
@@ -50,9 +52,11 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         return state
     goal = Goal(course.until, drive.targets, drive.quantity, course.steps or MOST_STEPS, drive.first)
     walked = Walked(followed(stage, path, start, goal, load.branch_points))
-    wrong = ""
+    wrong, first = "", None
     for record in walked:
         located = record.label in LOCATED
+        if located and not record.branch and first is None:
+            first = record
         yield replace(record, label=course.label) if course.label and not located else record
         if located and course.forbidden and not wrong:
             wrong = course.forbidden(record.point.state.mu, record.mode or record.label)
@@ -60,7 +64,40 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
             raise Stopped(wrong)
     if wrong:
         raise Stopped(wrong)
+    if load.branch_points and first and excluded(first):
+        yield from leaving(stage, first, off_path(goal, load.branch_points), abs(drive.scale), 1)
     return walked.end
+
+
+def followed_on(scene: Scene, step: ProgrammeStep, found: Record) -> Records:
+    """The records of the branch at the bifurcation that ends a step, to its target or for `points` steps.
+
+    The model is the smallest that has the mode, and so is that of the state at the end.
+
+    Raises
+    ------
+    Stopped
+        If the branch is not found, or lost.
+    """
+    stage, drive = stage_of(scene, step, found.point.state), _drive(scene, step, found.point.state)
+    end = drive.end
+    goal = Goal("points", steps=step.load.points) if end is None else Goal("target", [end], drive.quantity)
+    return (yield from leaving(stage, found, goal, abs(drive.scale), 0))
+
+
+def departure_of(scene: Scene, step: ProgrammeStep, found: Record) -> Departure:
+    """The bifurcation that ends a step, in the model that has its mode."""
+    scale = abs(_drive(scene, step, found.point.state).scale)
+    return departed(stage_of(scene, step, found.point.state), found, scale)
+
+
+def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
+    return step.load.course(_here(scene, step, state)).drive
+
+
+def excluded(record: Record) -> bool:
+    """Whether it is a bifurcation into a mode that the model excludes."""
+    return record.label == "bifurcation" and record.mode not in OWN_MODES
 
 
 def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: Drive) -> Records:

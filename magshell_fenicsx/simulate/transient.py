@@ -267,20 +267,18 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:
-    """The records of a snap from a fold to rest; its return value is the state at its end.
+    """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state at its end.
 
     Loads are constant, except those whose conjugates are `held`.
 
-    The shell leaves the fold along the path's direction there. Its drag is in proportion to the frequency of its third
-    mode of vibration: the first one has none at a fold.
+    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its drag is in proportion
+    to the frequency of its third mode of vibration: the first one has none there.
 
     Raises
     ------
     Stopped
-        If the point is no fold of the model itself, or the shell does not come to rest.
+        If the shell does not come to rest.
     """
-    if fold.label != "fold" or fold.mode:
-        raise Stopped(f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the model itself")
     state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
     own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
     omega = float(np.sqrt(max(own[1:])))

@@ -153,27 +153,44 @@ def _onward(stage: Stage, walk: Walk) -> Walk | None:
 
 def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
     """Follow both directions of a branch, to the target of the path or for a number of steps."""
-    lost, watch = [], stage.scene.watch
-    if goal.until != "target":
-        goal = Goal("points", steps=steps)
+    lost = []
     for number, start in enumerate(crossing.starts, 1):
-        by_arc = _by_arc(stage, path)
-        walk = _walk(stage, by_arc, start, goal)
-        watch.begin(by_arc, start, stage.leave, look=True)
-        yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
         try:
-            for label, point in walk:
-                for found in _excluded(
-                    by_arc, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))
-                ):
-                    yield replace(found, branch=number)
-                yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
-        except PathStopped as e:
-            lost.append(f"branch {number}: {_why(stage.scene, by_arc, e, walk.points)}")
-        for found in _excluded(by_arc, watch.end()):
-            yield replace(found, branch=number)
+            yield from branch(stage, _by_arc(stage, path), start, off_path(goal, steps), number)
+        except Stopped as e:
+            lost.append(f"branch {number}: {e}")
     if lost:
         raise Stopped("; ".join(lost))
+
+
+def off_path(goal: Goal, steps: int) -> Goal:
+    """Where a branch ends: at the target of the path, or after a number of steps."""
+    return goal if goal.until == "target" else Goal("points", steps=steps)
+
+
+def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> Records:
+    """The records of a branch, by arc length, with its `number`; the state at the end of the step's system.
+
+    Raises
+    ------
+    Stopped
+        If the branch is lost.
+    """
+    walk, watch, lost = _walk(stage, path, start, goal), stage.scene.watch, ""
+    watch.begin(path, start, stage.leave, look=True)
+    yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
+    try:
+        for label, point in walk:
+            for found in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
+                yield replace(found, branch=number)
+            yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
+    except PathStopped as e:
+        lost = _why(stage.scene, path, e, walk.points)
+    for found in _excluded(path, watch.end()):
+        yield replace(found, branch=number)
+    if lost:
+        raise Stopped(lost)
+    return walk.points[-1].state
 
 
 def _by_arc(stage: Stage, path: Path) -> Path:

@@ -206,6 +206,16 @@ def test_cylinder_waves() -> None:
 
 
 @pytest.mark.slow
+def test_cap_waves_branch() -> None:
+    """The fold of the branch of five waves, p/p_c = 0.474389 of the sector with elements of two thirds the size."""
+    found = result("cap_waves_branch.yaml")
+    first, fold = found.limit_points[:2]
+    assert (first["mode"], fold["kind"]) == ("m = 5", "fold")
+    assert fold["p_over_pc"] == pytest.approx(0.474389, rel=3e-4)
+    assert found.scene_of(found.end).model.multiplicity == 10
+
+
+@pytest.mark.slow
 def test_bracket() -> None:
     """w = F b^2 (a + b/3)/(E I) (Bernoulli): the fold of the mesh is part of the undeformed shape."""
     found = result("bracket.yaml")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.output.fields.gathering import Gatherer
-from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.fields.surface import Surface, turned, whole
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import read_csv, table_text
@@ -77,9 +77,9 @@ def mode_surface(
     if base is None or mode is None:
         return None
     surface = _with_mode(base, mode.u)
-    if model.multiplicity == 2:
+    if model.multiplicity > 1:
         assert not model.axisymmetric
-        surface = completed(surface, model.mirror.plane)
+        surface = whole(surface, model.mirror)
         if label == "antisymmetric":
             for values in surface.fields.values():
                 values[len(base.r0) :] *= -1

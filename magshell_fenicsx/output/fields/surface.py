@@ -1,6 +1,6 @@
 """The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from dolfinx.cpp.io import perm_vtk
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
@@ -30,6 +30,7 @@ PRESSURE = "contact_pressure"  # of bodies and of parts of the shell, over E h/R
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
 ON_PLANE = 1e-9  # over R
+NEAREST, FLAT = 12, 1e-2  # nodes of a linear fit, and directions without any extent that it leaves out
 Array = NDArray[np.float64]
 
 
@@ -251,6 +252,49 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         surface.strain_jump,
         surface.solids,
     )
+
+
+def whole(surface: Surface, mirror: Mirror) -> Surface:
+    """All of the shell from the half, or the sector, that is modelled."""
+    found = completed(surface, mirror.plane)
+    if not isinstance(mirror, Sector):
+        return found
+    turns = [image.Q.T for image in mirror.images if image.sign > 0]
+    copies = [_moved(found, Q) for Q in turns]
+    count = len(found.r0)
+
+    def every(of: Callable[[Surface], Array]) -> Array:
+        return np.concatenate([of(copy) for copy in copies])
+
+    return replace(
+        found,
+        r0=every(lambda s: s.r0),
+        u=every(lambda s: s.u),
+        n0=every(lambda s: s.n0),
+        cells=np.concatenate([found.cells + k * count for k in range(len(copies))]),
+        fields={name: every(lambda s, name=name: s.fields[name]) for name in found.fields},  # type: ignore[misc]
+    )
+
+
+def on_nodes_of(surface: Surface, like: Surface) -> Surface:
+    """Displacements and fields at the nodes of another mesh of the same shell; itself on that mesh.
+
+    By linear functions through the nearest nodes: exact to the second order of their distance.
+    """
+    if surface.r0.shape == like.r0.shape and np.abs(surface.r0 - like.r0).max() < ON_PLANE:
+        return surface
+    distance, near = scipy.spatial.cKDTree(surface.r0).query(like.r0, NEAREST)
+    beside = surface.r0[near] - like.r0[:, None]
+    size = np.maximum(distance.max(axis=1), ON_PLANE)[:, None]
+    weight = np.exp(-((2 * distance / size) ** 2))[..., None]
+    basis = np.concatenate([np.ones((*near.shape, 1)), beside / size[..., None]], axis=2)
+    rows = np.linalg.pinv(weight * basis, rcond=FLAT)[:, 0] * weight[..., 0]
+
+    def moved(f: Array) -> Array:
+        return np.asarray(np.einsum("nk,nk...->n...", rows, f[near]))
+
+    fields = {name: moved(f) for name, f in surface.fields.items()}
+    return replace(surface, r0=like.r0, u=moved(surface.u), n0=like.n0, cells=like.cells, fields=fields)
 
 
 def _parity(surface: Surface, normal: Array, offset: float) -> float:

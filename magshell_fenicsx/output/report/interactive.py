@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.surface import Surface, on_nodes_of
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
@@ -120,7 +120,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
     surface, about = read_point(fields, int(about_row["point"]))
     mesh = thinned(surface, MOST_VALUES // FEWEST_FRAMES)
     frames = chosen_frames(rows, min(MOST_FRAMES, MOST_VALUES // mesh.count))
-    shells = [read_point(fields, int(row["point"]))[0] for row in frames]
+    shells = [on_nodes_of(read_point(fields, int(row["point"]))[0], surface) for row in frames]
     packed = _Packed()
     content: dict[str, Any] = {
         **_path(rows, last, pole_of(case)),

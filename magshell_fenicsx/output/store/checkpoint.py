@@ -241,16 +241,24 @@ class Checkpoint:
     def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
         self._file, self._comm, self.replayed = file, comm, 0
         self._writing: AppendedFile | None = None
-        places = by_first(comm, self._begin, "cannot be read")
-        self._ordering = Ordering(V, comm, places)
+        self._replaying = True
+        by_first(comm, self._begin, "cannot be read")
+        self.begin(V)
+
+    def _begin(self) -> None:
+        self._reading = open_result(self._file)
+        read_frame(self._reading)
+
+    def begin(self, space: fem.FunctionSpace) -> None:
+        """The results from here on have the values of this space, whose nodes come first."""
+        places = by_first(self._comm, self._places, "cannot be read") if self._replaying else None
+        self._ordering = Ordering(space, self._comm, places)
         self._replaying = places is not None
         if not self._replaying:
             self._append(self._ordering.places.tobytes())
 
-    def _begin(self) -> Array | None:
+    def _places(self) -> Array | None:
         """The positions of the nodes, if the file has them."""
-        self._reading = open_result(self._file)
-        read_frame(self._reading)
         content = read_frame(self._reading)
         return None if content is None else np.frombuffer(content).reshape(-1, 3)
 

@@ -141,7 +141,9 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         unit = E * t if load.edge else E * t / R
         pattern = _pattern(load, Q, R, 1 / unit)
         return EdgeForce(load.edge, pattern, total=False) if load.edge else AreaForce(_over(load), pattern)
-    force = np.asarray((0.5 if shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R))
+    force = np.asarray(
+        (1 / mirror.copies if mirror and shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R)
+    )
     if load.at is not None:
         return PointForce(load.at, force)
     if load.edge is not None and load.moment is not None:

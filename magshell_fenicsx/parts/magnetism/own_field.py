@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.mirror import Image, rotation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
@@ -76,13 +76,13 @@ class OwnField:
     def B(self, families: Sequence[Family], mu: Mapping[str, float], x: Array) -> Array:
         """The field (3,) at a place, of a remanence of length one; nan in the shell; collective."""
         try:
-            images = [x, *([self._sight.mirror.image(x)] if self._sight.mirror else [])]
+            images = [image.back(x) for image in self._images]
             if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
                 raise TooNear
-            found = field(families, x[None])[0]
-            if mirror := self._sight.mirror:
-                sign = self.sign_of_images(mu)
-                found = found + sign * mirror.reflection @ field(families, mirror.image(x)[None])[0]
+            found = np.zeros(3)
+            for image in self._images:
+                sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
+                found = found + sign * image.Q @ field(families, image.back(x)[None])[0]
         except TooNear:
             found = np.full(3, np.nan)
         return np.asarray(self._model.system.comm.allreduce(found))
@@ -93,9 +93,9 @@ class OwnField:
         for may in (False, True) if self._plain else (True,):  # charges that are zero have derivatives
             shape, families = self.families(mu, may=may)
             into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
-            gradient(families, x, e, into)
-            if mirror := self._sight.mirror:
-                gradient(families, mirror.image(x), self.sign_of_images(mu) * mirror.reflection @ e, into)
+            for image in self._images:
+                sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
+                gradient(families, image.back(x), sign * image.Q.T @ e, into)
             parts.append(into)
         into = Nodal(parts[0].by_u, parts[-1].by_remanence)
         return into if self._plain else self._to_material(into, mu)
@@ -104,8 +104,14 @@ class OwnField:
         """The integral of the remanence as the shell carries it over its volume, (3,) over R³; collective."""
         found = np.asarray(self._model.system.comm.allreduce(moment(families)))
         if mirror := self._sight.mirror:
-            found = found + self.sign_of_images(mu) * mirror.reflection @ found
+            found = mirror.summed(found, self.sign_of_images(mu))
         return found
+
+    @property
+    def _images(self) -> list[Image]:
+        """Those of what is modelled, which make the whole shell."""
+        mirror = self._sight.mirror
+        return mirror.images if mirror else [Image(np.eye(3), np.zeros(3), 1.0)]
 
     def shape(self, mu: Mapping[str, float]) -> Shape:
         """Its shape and remanence at the displacement that the system has."""
@@ -290,7 +296,8 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
         found = [each for family in families for each in triangles(family, parts)]
         if mirror:
             sign = own.sign_of_images(state.mu)
-            found += [(mirror.image(x), sign * q) for x, q in found]
+            copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
+            found = [(image.of(x), factor * q) for image, factor in copies for x, q in found]
         return found
 
     system = sight.model.system

@@ -62,7 +62,7 @@ class SoftSeen(Seen):
         if 1 not in sight.model.axes:  # of a meridian, with which they turn
             J[:2] = 0.0
         if sight.mirror:
-            J = (J + parity(sight, field, state, sight.mirror) * sight.mirror.reflection @ J) / 2
+            J = sight.mirror.summed(J, parity(sight, field, state, sight.mirror)) / sight.mirror.copies
         return dict(zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True))
 
 

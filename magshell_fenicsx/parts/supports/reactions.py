@@ -38,6 +38,10 @@ class Reaction:
         """What the mirror image of the support does; `S` mirrors vectors, and `point` is the image of the point."""
         return Reaction(S @ self.force, -S @ self.moment, point)
 
+    def whole(self, mirror: Mirror) -> "Reaction":
+        """What a support does that is its own image, the point too."""
+        return Reaction(mirror.summed(self.force), mirror.summed(self.moment, -1.0), self.point)
+
 
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """The reactions of all supports in the model's frame; collective.
@@ -48,7 +52,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     Parameters
     ----------
     mirror
-        The plane of a half model: the reactions are those of the whole shell.
+        Of a half model or a sector: the reactions are those of the whole shell.
     """
     system, comm = model.system, model.system.comm
     R, taken = system.forces(state.u, state.mu), np.zeros(system.size, dtype=bool)
@@ -81,7 +85,7 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
     if mirror and name in mirror.lost:
         name, way = mirror.lost[name], mirror.reflection @ way
     elif mirror and mirror.other(name) == name:
-        way = way + mirror.reflection @ way
+        way = mirror.summed(way)
     taken = np.zeros(system.size, dtype=bool)
     for other, support in model.supports.items():
         dofs = support.dofs[support.dofs < system.size]
@@ -102,15 +106,14 @@ def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reactio
             found[lost] = half[kept].image(S, mirror.image(half[kept].point))
     for name, one in half.items():
         if mirror.other(name) == name:
-            other = one.image(S, one.point)
-            found[name] = Reaction(one.force + other.force, one.moment + other.moment, one.point)
+            found[name] = one.whole(mirror)
     return found
 
 
 def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
     """Corners (2, 3) of a box around places (n, 3) of all ranks, and around their mirror images."""
     if mirror:
-        places = np.concatenate([places, mirror.image(places)])
+        places = mirror.everywhere(places)
     corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
     all_corners = np.array(comm.allgather(corners))
     return np.array([all_corners[:, 0].min(axis=0), all_corners[:, 1].max(axis=0)])

@@ -48,7 +48,7 @@ def pairs(given: Sequence[Sequence[str]], nu: float) -> "tuple[Pair, ...]":
     return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
 
 
-def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str) -> None:
+def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:
     """See that a model can have these contacts.
 
     Raises

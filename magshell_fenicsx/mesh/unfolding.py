@@ -1,0 +1,110 @@
+"""The mesh of a sector around e3 and its mirror images, side by side."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, rotation
+from magshell_fenicsx.mesh.patch import PatchMesh
+
+Array = NDArray[np.float64]
+CLOSE = 1e-7  # over the chart's extent: nodes that are one
+TURNED_OVER = {
+    3: [0, 2, 1],
+    6: [0, 2, 1, 5, 4, 3],
+    10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9],
+}  # gmsh's nodes of a mirrored cell
+
+
+class Folding:
+    """Copies of a sector side by side: copy k lies between the azimuths k and k + 1 times its angle.
+
+    Parameters
+    ----------
+    angle
+        Of the sector (rad), which begins at azimuth 0.
+    count
+        Of the copies, the first of which is the sector itself.
+    patch
+        Its triangulation, in the chart of a disc around the axis, or of a rectangle whose first axis goes around e3.
+    """
+
+    def __init__(self, angle: float, count: int, patch: PatchMesh) -> None:
+        self.count, self._angle = count, angle
+        places, turn = patch.embedding(patch.nodes), rotation(-angle)
+        turned = patch.embedding(patch.nodes @ turn[:2, :2].T)
+        self.round = bool(np.abs(turned - places @ turn.T).max() < CLOSE * np.abs(places).max())
+        self.end = angle if self.round else float(patch.nodes[:, 0].max())
+
+    def image(self, chart: Array, k: int) -> Array:
+        """Copy k of places of the chart."""
+        if self.round:
+            return np.asarray(chart @ self.turn(k)[:2, :2].T)
+        x = (k + 1) * self.end - chart[:, 0] if k % 2 else k * self.end + chart[:, 0]
+        return np.column_stack([x, chart[:, 1]])
+
+    def turn(self, k: int) -> Array:
+        """The matrix (3, 3) that takes vectors of the sector to copy k."""
+        if k % 2:
+            return np.asarray(rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0]))
+        return rotation(-k * self._angle)
+
+    def copies(self, chart: Array) -> NDArray[np.int64]:
+        """In which copy each place (n, 2) of the half lies."""
+        along = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]  # at pi rounding has a sign
+        return np.asarray(np.clip(np.floor(along / self.end), 0, self.count - 1), dtype=np.int64)
+
+    def back(self, chart: Array) -> Array:
+        """The places of the sector whose copies these are."""
+        found, copies = np.empty_like(chart), self.copies(chart)
+        for k in range(self.count):
+            here = copies == k
+            if self.round:
+                found[here] = chart[here] @ self.turn(k)[:2, :2]
+            else:
+                x = chart[here, 0]
+                found[here, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
+                found[here, 1] = chart[here, 1]
+        return found
+
+
+def unfolded(patch: PatchMesh, folding: Folding, ends: tuple[str, str]) -> PatchMesh:
+    """The triangulation of all copies, from that of the sector; the edges where it begins and ends have these names."""
+    n, count = len(patch.nodes), folding.count
+    nodes = np.concatenate([folding.image(patch.nodes, k) for k in range(count)])
+    over = TURNED_OVER[patch.cells.shape[1]]
+    cells = np.concatenate([k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(count)])
+    tree = scipy.spatial.cKDTree(nodes)
+    near = tree.query_ball_point(nodes, CLOSE * np.ptp(nodes, axis=0).max())
+    same = np.array([min(each) for each in near])
+    one = np.arange(n) if patch.one is None else patch.one
+    glued = same[np.concatenate([k * n + one for k in range(count)])]
+    used, numbers = np.unique(same, return_inverse=True)
+    new = np.full(len(nodes), -1, dtype=np.int64)
+    new[used] = np.arange(len(used))
+
+    def copied(name: str, ks: Sequence[int]) -> NDArray[np.int64]:
+        return np.concatenate([new[glued[k * n + patch.edges[name]]] for k in ks])
+
+    last = count - 1
+    edges = {name: copied(name, range(count)) for name in patch.edges if name not in (CUT, SECOND_CUT)}
+    first, second = copied(CUT, [0]), copied(CUT if last % 2 else SECOND_CUT, [last])
+    edges |= (
+        {CUT: np.concatenate([first, second])} if ends == (CUT, CUT) else dict(zip(ends, (first, second), strict=True))
+    )
+    return replace(
+        patch,
+        nodes=nodes[used],
+        cells=numbers[cells],
+        edges=edges,
+        one=None if patch.one is None else new[glued[used]],
+        patches={name: np.tile(inside, count) for name, inside in patch.patches.items()},
+    )
+
+
+def doubled(patch: PatchMesh, angle: float) -> PatchMesh:
+    """A sector of an angle (rad) from the triangulation of its first half."""
+    return unfolded(patch, Folding(angle / 2, 2, patch), (CUT, SECOND_CUT))

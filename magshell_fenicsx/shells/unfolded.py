@@ -1,0 +1,106 @@
+"""Stability of a sector against the modes that its two planes exclude, on the half that its copies make.
+
+The mesh of the half is that of the sector and its images, so the state of the half is that of the sector to rounding.
+Its own tangent and that of its antisymmetric modes count all modes of the shell. Where nothing but the buckled shape
+itself distinguishes one azimuth from another, that shape may turn about e3 without any force: this one direction is
+left out of the count, which would depend on rounding.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
+from magshell_fenicsx.continuation.watch import Family
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.mirror import CUT, Sector
+from magshell_fenicsx.mesh.unfolding import Folding, unfolded
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shells.shell import ShellModel
+
+Array = NDArray[np.float64]
+SEEN = 1e-3  # in lengths: a state that differs less around e3 is axisymmetric
+
+
+class UnfoldedModes:
+    """Numbers of the unstable modes that a sector excludes.
+
+    Parameters
+    ----------
+    model
+        Of the sector.
+    as_half
+        The same shell on the mid-surface of a half.
+    """
+
+    families: Sequence[Family] = ()  # they are counted and not located: the turned shape is always neutral
+
+    def __init__(self, model: "ShellModel", as_half: "Callable[[Midsurface], ShellModel]") -> None:
+        self._model, self._as_half = model, as_half
+        self._own, self._others = Factorisation(model.system.comm), Factorisation(model.system.comm)
+
+    @cached_property
+    def half(self) -> "ShellModel":
+        """The model whose tangents are counted."""
+        sector, patch = self._model.mirror, self._model.midsurface.patch
+        assert isinstance(sector, Sector)
+        self._folding = Folding(sector.angle, sector.waves, patch)
+        half = self._as_half(distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm))
+        comm, chart = self._model.system.comm, half.chart()
+        nodes = np.concatenate(comm.allgather(self._model.chart()))
+        self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.back(chart))[1]
+        self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[self._folding.copies(chart)]
+        return half
+
+    def unfolded(self, u: Vector) -> Vector:
+        """A displacement of the sector as that of the half; collective."""
+        half, system = self.half, self._model.system
+        whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
+        return np.asarray(half.system.held(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel()))
+
+    def counts(self, state: State) -> Sequence[int]:
+        """Unstable modes of the half that the sector excludes, and those that are antisymmetric to the half."""
+        half, there = self.half, State(self.unfolded(state.u), dict(state.mu))
+        self._own.factor(self._model.system.tangent(state.u, state.mu))
+        own = self._own.negative_pivots
+        self._others.factor(half.system.tangent(there.u, there.mu))
+        symmetric = self._others.negative_pivots - own
+        modes = half.excluded_modes
+        assert isinstance(modes, AntisymmetricModes)
+        factors = modes.factor_at(there)
+        antisymmetric = factors.negative_pivots
+        t = self._turning(there)
+        if t is not None and dot(half.system.comm, t, factors.solve(t)) < 0:  # of the tangent on the complement of t
+            antisymmetric -= 1
+        return [max(symmetric, 0), antisymmetric]
+
+    def is_unstable(self, state: State) -> bool:
+        """Whether such a mode is unstable."""
+        return any(self.counts(state))
+
+    def _turning(self, state: State) -> Vector | None:
+        """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None without any."""
+        half, system, modes = self.half, self.half.system, self.half.excluded_modes
+        if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
+            return None
+        V = half.V
+        u, r0 = system.with_ghosts(state.u, state.mu).reshape(-1, 3), half.r0.x.array.reshape(-1, 3)
+        dofs, element = V.dofmap.list, V.element.basix_element
+        table = element.tabulate(1, element.points)[1:, :, :, 0]
+        a, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
+        around = np.cross([0.0, 0.0, 1.0], r0[dofs])
+        metric = np.einsum("nqdi,nqei->nqde", a, a)
+        c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, around)[..., None])[..., 0]
+        by_angle, total, count = np.einsum("nqd,nqdi->nqi", c, du), np.zeros_like(u), np.zeros(len(u))
+        np.add.at(total, dofs, by_angle)
+        np.add.at(count, dofs, 1.0)
+        t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]
+        t = modes.system.held(t.ravel()[: system.size])
+        return t if max_abs(system.comm, t) > SEEN * system.length else None

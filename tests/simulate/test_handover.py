@@ -1,0 +1,176 @@
+"""Branches of modes that a reduced model excludes, in the smallest model that has them."""
+
+from itertools import pairwise
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell, read_path
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.control import GivenConjugate
+from magshell_fenicsx.continuation.modes import critical_mode
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Sector, rotation
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.public import problem_of
+from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.handover import through
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+FOLLOWED = {"kind": "pressure", "until": "bifurcation", "then": "follow", "points": 3}
+CAP = {
+    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.01, "polar": 30.0, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "loading": FOLLOWED,
+}
+FINER = {"mesh": {"refinement": 1.5}}
+WAVES = {  # of h/1000 at most on these shells: the real part of (x + i y)^m
+    "cap": (CAP | FINER, 5, "0.03*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
+}
+
+
+def _whole(scene: Scene, state: State) -> tuple[Array, Array]:
+    """Places and displacements of all nodes of a sector and their images, in the frame of the case."""
+    mirror, size = scene.problem.mirror, scene.model.system.size
+    assert isinstance(mirror, Sector)
+    x, u = scene.model.r0.x.array[:size].reshape(-1, 3), state.u[:size].reshape(-1, 3)
+    turn = rotation(scene.problem.azimuth)
+    places = np.concatenate([image.of(x) for image in mirror.images]) @ turn
+    moved = np.concatenate([u @ image.Q.T for image in mirror.images]) @ turn
+    _, first = np.unique(np.round(places, 7), axis=0, return_index=True)
+    return places[first], moved[first]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WAVES)
+def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
+    """Of shells of their own meshes, with an imperfection of h/1000 in the mode's waves, at the same volumes.
+
+    They carry the same pressure to 1e-3 at three amplitudes, and have as many unstable directions. They are halves,
+    whose plane holds the waves where they are: a whole shell may turn them about e3 almost without a force. Their own
+    count of antisymmetric modes has this one or not.
+    """
+    case, m, waves = WAVES[name]
+    records = list(follow(Scene(problem_of(case)), remark=lambda said: None))
+    branch = [r for r in records if r.label == "step" and r.scene is not records[0].scene][-3:]
+    flawed = case["shell"] | {"imperfections": [{"kind": "formula", "w0": f"-({waves})"}]}
+    full = Scene(problem_of({**case, "shell": flawed, "symmetry": "half", "loading": {"kind": "pressure"}}))
+    turn = rotation(full.problem.azimuth)
+    x = full.model.r0.x.array[: full.model.system.size].reshape(-1, 3)
+    for record in branch:
+        scene, state = record.scene, record.point.state
+        assert scene
+        assert scene.problem.included[0] == f"sector of {180 / m:g} degrees of the shell"
+        guess = full.model.system.held((through(*_whole(scene, state), x @ turn) @ turn.T).ravel())
+        copies = scene.model.multiplicity / full.model.multiplicity
+        volume = copies * scene.model.system.potential(state.u, state.mu, "pressure")
+        row = GivenConjugate(full.model.system, "pressure", -volume)
+        found = full.newton.solve(State(guess, {**full.unloaded().mu, **state.mu}), "pressure", row)
+        assert found.converged
+        assert found.state.mu["pressure"] == pytest.approx(state.mu["pressure"], rel=1e-3)
+        counted = record.point.negative_pivots + record.excluded_pivots
+        assert full.model.excluded_modes
+        others = sum(full.model.excluded_modes.counts(found.state))
+        assert full.newton.factor_at(found.state).negative_pivots + others in (counted, counted + 1)
+
+
+def test_handing_over_is_continuous_to_the_meshes_error() -> None:
+    """Load, energy and deflection of the meridian; the mode's stiffness is zero in both models."""
+    records = list(follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None))
+    old, new = next((a, b) for a, b in pairwise(records) if a.mode == "m = 5")
+    assert new.scene is not old.scene
+    assert old.scene
+    assert new.scene
+    assert new.point.state.mu["pressure"] == pytest.approx(old.point.state.mu["pressure"], rel=1e-4)
+    one, two = old.scene.observe(old.point.state), new.scene.observe(new.point.state)
+    for column in ("energy", "volume_change", "w_pole_over_h"):
+        assert two[column] == pytest.approx(one[column], rel=3e-4)
+    waves = old.scene.model.excluded_modes.waves
+    stiff = abs(waves.critical_eigenvalue(records[1].point.state, 5))
+    assert abs(waves.critical_eigenvalue(old.point.state, 5)) < 1e-6 * stiff
+    lowest = ShellModes(new.scene.model).lowest(new.point.state, 2)
+    assert abs(lowest[0].eigenvalue) < 1e-6 * lowest[1].eigenvalue
+
+
+def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
+    """p/p_c = 1 + (27/32) (w/R)^2 of an inextensible ring under hydrostatic pressure, p_c = 3 D/R^3.
+
+    Budiansky, Theory of buckling and post-buckling behavior of elastic structures, Adv. Appl. Mech. 14 (1974). The ring
+    is held by nothing, which a case is not allowed: a sector excludes its rigid motions.
+    """
+    own = BoundarySection.leaves
+    monkeypatch.setattr(BoundarySection, "leaves", lambda self, context, outline: own(self, context, outline)[:-1])
+    h = 0.01
+    shell = {"geometry": "cylinder", "radius": 1.0, "length": 0.12, "thickness": h, "poisson_ratio": 0.0}
+    case = {"shell": shell, "boundary": {"bottom": "symmetry", "top": "symmetry"}, "mesh": {"size": 0.24, "degree": 4}}
+    scene = Scene(problem_of({**case, "symmetry": 2, "loading": FOLLOWED}))
+    records = list(follow(scene, remark=lambda said: None))
+    x, unit = scene.model.r0.x.array.reshape(-1, 3), scene.problem.material.classical_pressure
+    crest, trough = (int(np.argmin(np.linalg.norm(x - place, axis=1))) for place in np.eye(3)[:2])
+
+    def bend(record: Record) -> float:
+        u = record.point.state.u.reshape(-1, 3)
+        return float(u[crest, 0] - u[trough, 1]) / 2
+
+    pressures = [record.point.state.mu["pressure"] for record in records]
+    assert pressures[1] * unit == pytest.approx(3 * h**3 / 12, rel=1e-4)
+    for record, pressure in zip(records[3:], pressures[3:], strict=True):
+        assert (pressure / pressures[1] - 1) / bend(record) ** 2 == pytest.approx(27 / 32, rel=0.01)
+
+
+def test_a_half_hands_over_to_the_whole_shell() -> None:
+    """A shallow pinned arch of rise parameter 2.6 buckles to one side before its fold (Fung and Kaplan 1952).
+
+    The half finds an antisymmetric mode; on its branch, in the whole shell, the load falls.
+    """
+    shell = {"geometry": "plate", "length": 1.0, "width": 0.05, "thickness": 0.01, "youngs_modulus": 1.0}
+    shell |= {"poisson_ratio": 0.0, "imperfections": [{"kind": "formula", "w0": "sin(pi*x)", "amplitude": 1.50111}]}
+    dead = {"over": "all", "per_area": ["0", "0", f"{-4 * pi**4 / 12 * 1e-8 * 0.577350269 / 2 / 2!r}*sin(pi*x)"]}
+    load = {"kind": "dead", "loads": [dead], "until": "bifurcation", "then": "follow", "points": 2}
+    case = {"shell": shell, "boundary": {"left": "hinged", "right": "hinged"}, "mesh": {"size": 0.05}, "loading": load}
+    records = list(follow(Scene(problem_of(case)), remark=lambda said: None))
+    old, new = next((a, b) for a, b in pairwise(records) if a.mode == "antisymmetric")
+    assert old.scene
+    assert new.scene
+    assert (old.scene.model.multiplicity, new.scene.model.multiplicity) == (2, 1)
+    assert new.point.state.mu["load"] == pytest.approx(old.point.state.mu["load"], rel=1e-6)
+    one, two = old.scene.observe(old.point.state), new.scene.observe(new.point.state)
+    assert two["energy"] == pytest.approx(one["energy"], rel=1e-5)
+    phi = critical_mode(new.scene.newton, new.point.state)
+    assert abs(phi.eigenvalue) < 1e-9
+    assert records[-1].point.state.mu["load"] < old.point.state.mu["load"]
+
+
+@pytest.mark.slow
+def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: Path) -> None:
+    """The same path as an uninterrupted run on one rank."""
+    case = tmp_path / "case.yaml"
+    case.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 30, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\nloading: {kind: pressure, until: bifurcation, then: follow, points: 2}\n"
+    )
+    one, cut = tmp_path / "one", tmp_path / "cut"
+    assert magshell("run", case, "--out", one, "--no-pictures").returncode == 0
+    wanted = read_path(one)
+    content = (one / "fields" / "path.pvd").read_text()
+    assert content.count("point_") == len(wanted)
+    for limit in (1, 4):
+        magshell("run", case, "--out", cut, "--no-pictures", "--time-limit", str(limit), *(["--resume"] * (limit > 1)))
+    assert magshell("run", case, "--out", cut, "--no-pictures", "--resume").returncode == 0
+    for ranks in (2, 3):
+        out = tmp_path / f"ranks_{ranks}"
+        assert magshell("run", case, "--out", out, "--no-pictures", ranks=ranks).returncode == 0
+    for out in (cut, tmp_path / "ranks_2", tmp_path / "ranks_3"):
+        for row, there in zip(read_path(out), wanted, strict=True):
+            assert (row["label"], row["mode"], row["excluded_pivots"]) == (
+                there["label"],
+                there["mode"],
+                there["excluded_pivots"],
+            )
+            for column in ("p_over_pc", "w_over_h", "energy"):
+                assert float(row[column]) == pytest.approx(float(there[column]), rel=1e-5, abs=1e-12)
