@@ -9,9 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
+from magshell_fenicsx.case.shells import Several, Shells, expanded, written
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, lengths_with_units, texts
@@ -90,6 +100,10 @@ class Case(WithParts):
     """What is held"""
     points: dict[str, Coordinates] = Field(default_factory=dict)
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
+    shells: Shells | None = None
+    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. The R of the
+    first is that of formulas and results, its thickness the h of these; all have one material. The edge or point `rim`
+    of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns, and the shell itself is the patch `upper`"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
@@ -127,10 +141,27 @@ class Case(WithParts):
     that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge
     (axisymmetric)"""
 
+    _several: Several | None = PrivateAttr(default=None)
+
+    @property
+    def several(self) -> Several | None:
+        """The shells of a case that has several."""
+        return self._several
+
+    @model_serializer(mode="wrap")
+    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return written(handler(self), self.shells)
+
     @model_validator(mode="wrap")
     @classmethod
-    def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _units_go_with_those_of_the_shell(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        data, several = expanded(data, info.context, cls)
         section = handler(data)
+        if several and isinstance(section.shell, MeshSurface):
+            section._several = several
+            section.shell.files.given[section.shell.path] = several.assembly
         if isinstance(data, dict) and not section.shell.with_units:
             parts = {key: data.get(key) for key in ("points", "mesh", "sensors", *PARTS)}
             written = listed(data.get("loading"))
@@ -246,7 +277,7 @@ class Case(WithParts):
     @model_validator(mode="after")
     def _mesh_fits(self) -> Self:
         shell = self.shell
-        if isinstance(shell, MeshSurface):
+        if isinstance(shell, MeshSurface) and not self.several:
             for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}):
                 raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
         by_densities = self.magnetic is not None and self.magnetic.lambda_m is None and not self.magnetic.without_field
@@ -388,6 +419,7 @@ class Case(WithParts):
             "magnetic.remanent": self.remanent,
         }
         sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        sections |= self.several.readers if self.several else {}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod

@@ -22,6 +22,7 @@ from magshell_fenicsx.input.section import (
     or_number,
     texts,
 )
+from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
 
@@ -318,6 +319,11 @@ class MeshSurface(FileKeys, SurfaceSection):
     @property
     def reference(self) -> float:
         return self.radius
+
+    @property
+    def assembled(self) -> bool:
+        """Whether it stands for several shells."""
+        return isinstance(self.files.given.get(self.path), Assembly)
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface
