@@ -137,7 +137,8 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
-    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies, pairs=pairs(case.contact, material))
+    touching = pairs(case.contact, material, case.several and case.several.thicknesses)
+    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies, pairs=touching)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"

@@ -181,10 +181,10 @@ class Several:
                 found[part.refused("remanent")] = part.section.remanent
         return found
 
-    def thickness_of(self, name: str) -> float | None:
-        """That of a shell over that of the first one; None where it varies."""
-        part = next(part for part in self.parts if part.name == name)
-        return None if part.case.thickness_factor else self.ratio(part)
+    @property
+    def thicknesses(self) -> dict[str, float | None]:
+        """Of each over that of the first one; None where it varies."""
+        return {part.name: None if part.case.thickness_factor else self.ratio(part) for part in self.parts}
 
 
 def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -> "tuple[Any, Several | None]":

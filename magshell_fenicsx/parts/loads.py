@@ -20,6 +20,8 @@ class Loads:
 
     Attributes
     ----------
+    pressed
+        Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
     growing
@@ -35,6 +37,7 @@ class Loads:
     """
 
     pressure: bool = False
+    pressed: Mapping[str, float] = field(default_factory=dict)
     forces: Mapping[str, Force] = field(default_factory=dict)
     magnetic: Magnetisation | None = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)

@@ -1,10 +1,11 @@
 """The key `contact`: which shells may touch, and what a case with it can be."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
@@ -23,13 +24,43 @@ Pairs = Annotated[
 ]
 
 
-def pairs(given: Sequence[Sequence[str]], material: "Material") -> "tuple[Pair, ...]":
-    """What a case's pairs are in a model."""
+def pairs(
+    given: Sequence[Sequence[str]], material: "Material", thickness: Mapping[str, float | None] | None = None
+) -> "tuple[Pair, ...]":
+    """What a case's pairs are in a model.
+
+    Parameters
+    ----------
+    thickness
+        Of several shells: name -> thickness over h, None where it varies.
+
+    Raises
+    ------
+    ValueError
+        If the faces of a pair are not one distance from their mid-surfaces.
+    """
     from magshell_fenicsx.parts.touching.touching import Pair  # the solver takes long to import
 
     k = STIFF / (12 * (1 - material.nu**2))
     several = len(given) > 1
-    return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
+    return tuple(
+        Pair((one, other), f"_{one}_{other}" if several else "", k, thickness=_mean(i, (one, other), thickness or {}))
+        for i, (one, other) in enumerate(given)
+    )
+
+
+def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
+    """The mean of both thicknesses over h; a patch has that of its shell."""
+    found = list[float]()
+    for name in pair if thickness else ():
+        of = [t for shell, t in thickness.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
+        if None in of or len({*of}) > 1:
+            raise CaseError(
+                f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "
+                "shells of different thickness one by one"
+            )
+        found += [t for t in of[:1] if t is not None]
+    return sum(found) / len(found) if found else 1.0
 
 
 def leaves(given: Sequence[Sequence[str]]) -> list[Leaves]:
