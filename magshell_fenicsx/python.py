@@ -329,7 +329,9 @@ def _distribute(data: Keys) -> None:
         for name, value in data.pop(key).items():
             shell, dot, own = name.partition(".")
             if not dot or shell not in data["shells"]:
-                raise CaseError(f"{NAME}: {key}.{name}: begins with the name of a shell: {next(iter(data['shells']))}.rim")
+                raise CaseError(
+                    f"{NAME}: {key}.{name}: begins with the name of a shell: {next(iter(data['shells']))}.rim"
+                )
             _join(data["shells"][shell], key, {own: value})
 
 

@@ -1,6 +1,6 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
+from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
 from magshell_fenicsx.case.shells import Several, Shells, expanded, written
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
@@ -30,6 +30,7 @@ from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.joints import Joints, refuse_unfit_joints
 from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
@@ -60,33 +61,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
 
-REMANENCE = "magnetic.remanent.patches"
-
-
-def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
-    """See that a shell has the patches of a key; a mesh file knows its own later.
-
-    Parameters
-    ----------
-    dimples
-        Names of the patches within the rims of the shell's dimples.
-
-    Raises
-    ------
-    ValueError
-        If it has not, or the remanence of the rest is missing.
-    """
-    if isinstance(shell, MeshSurface):
-        return
-    if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
-        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
-    known = [*(dimples or ["dimple"]), "rest"]
-    if unknown := set(patches) - set(known):
-        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")
-    if key == REMANENCE and "rest" not in patches:
-        raise ValueError("magnetic.remanent: patches needs the patch rest")
-
-
 class Case(WithParts):
     """A shell, what holds it, its field and its load; validated."""
 
@@ -103,7 +77,7 @@ class Case(WithParts):
     shells: Shells | None = None
     """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. The R of the
     first is that of formulas and results, its thickness the h of these; all have one material. The edge or point `rim`
-    of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns, and the shell itself is the patch `upper`"""
+    of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
@@ -114,7 +88,9 @@ class Case(WithParts):
     """Name -> rigid body that presses on the shell, or stands in its way"""
     contact: Pairs = Field(default=[])
     """Pairs that may touch, half a thickness from their mid-surfaces, without friction: [[shell, shell]] is the shell
-    with itself; in place of `shell` the name of a patch of a mesh file"""
+    with itself; in place of `shell` the name of one of several shells, or of a patch of a mesh file"""
+    joints: Joints = Field(default=[])
+    """Edges of several shells that meet, and how they are joined"""
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
@@ -325,6 +301,7 @@ class Case(WithParts):
     @model_validator(mode="after")
     def _contact_fits(self) -> Self:
         refuse_unfit_pairs(self.contact, self.context, self.symmetry)
+        refuse_unfit_joints(self.joints, self.context)
         return self
 
     @model_validator(mode="after")

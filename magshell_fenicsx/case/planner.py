@@ -26,6 +26,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_fr
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
+from magshell_fenicsx.parts.joints import joints
 from magshell_fenicsx.parts.laminate import laminate_leaves, laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
@@ -138,7 +139,9 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
     touching = pairs(case.contact, material, case.several and case.several.thicknesses)
-    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies, pairs=touching)
+    all_loads = replace(
+        _loads(case, modelled), own=energies, contacts=bodies, pairs=touching, joints=joints(case.joints, context)
+    )
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"

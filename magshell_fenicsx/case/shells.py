@@ -1,7 +1,7 @@
 """The section `shells`: several shells in place of one, each as a case of its own, and one mesh of them all.
 
-Each shell is planned and meshed by its own case. Together they stand where a mesh file stands, so that all else sees one
-surface whose pieces are not connected: an edge, a point or a patch `rim` of the shell `upper` is `upper_rim` there.
+Each shell is planned and meshed by its own case. Together they stand where a mesh file stands, so that all else sees
+one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is `upper_rim` there.
 """
 
 import hashlib
@@ -112,8 +112,8 @@ class Part:
 class Several:
     """The shells of a case; an `Assembly` is made of them where a mesh is needed."""
 
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self.parts = parts
+    def __init__(self, parts: Sequence[Part], joints: Sequence[tuple[str, str]] = ()) -> None:
+        self.parts, self.joints = parts, joints
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Several":
         return self
@@ -125,7 +125,7 @@ class Several:
             [part.name, part.case.model_dump_json(), part.section.place.model_dump_json(), part.case.outside]
             for part in self.parts
         ]
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([told, self.joints], sort_keys=True).encode()).hexdigest()
 
     def place(self, part: Part) -> Place:
         """Where a shell is, over the R of the first one."""
@@ -135,7 +135,7 @@ class Several:
     @cached_property
     def assembly(self) -> Assembly:
         """All of them as one mesh."""
-        return Assembly(self.digest, self._members)
+        return Assembly(self.digest, self._members, self.joints)
 
     def _members(self) -> list[Member]:
         members = []
@@ -207,7 +207,7 @@ def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -
     parts = [
         Part(name, section, _case(name, data, {**around}, case)) for name, section in sections.items()
     ]  # in the order of the file
-    several = Several(parts)
+    several = Several(parts, _joined(_renamed(data.get("joints"), sections)))
     first = _merged(parts)
     whole = {key: _renamed(value, sections) if key in OF_NAMES else value for key, value in data.items()}
     whole |= {
@@ -261,9 +261,10 @@ def _case(name: str, data: Keys, context: Keys, case: "type[Case]") -> "Case":
     ]
     known = own["points"] if isinstance(own["points"], dict) else {}
     forces = [force for force in forces if force["at"]["point"] in known]  # type: ignore[index]
+    steps = [*forces, *([{"kind": "pressure"}] if _presses(loading, name) else [])]  # what mesh sizes follow
     try:
         made = case.model_validate(
-            {**own, "mesh": sizes, "symmetry": "none", **({"loading": forces} if forces else {})}, context=context
+            {**own, "mesh": sizes, "symmetry": "none", **({"loading": steps} if steps else {})}, context=context
         )
     except ValidationError as e:
         error = e.errors()[0]
@@ -272,6 +273,21 @@ def _case(name: str, data: Keys, context: Keys, case: "type[Case]") -> "Case":
     if not made.shell.with_units and [*texts(given.get("place"))]:
         raise ValueError(f"shells.{name}.place: has a unit, but the shell's lengths have none: give all one, or none")
     return made
+
+
+def _joined(joints: Any) -> list[tuple[str, str]]:
+    """The edges of joints, as far as these are such."""
+    edges = [each.get("edges") for each in joints if isinstance(each, dict)] if isinstance(joints, list) else []
+    return [(each[0], each[1]) for each in edges if isinstance(each, list) and len(each) == 2]
+
+
+def _presses(loading: Any, name: str) -> bool:
+    """Whether a step presses on a shell."""
+    steps = loading if isinstance(loading, list) else [loading]
+    return any(
+        isinstance(load, dict) and load.get("kind") == "pressure" and name in (load.get("on") or (name,))
+        for load in steps
+    )
 
 
 def _merged(parts: Sequence[Part]) -> Keys:

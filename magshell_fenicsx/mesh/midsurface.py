@@ -121,6 +121,11 @@ class Midsurface:
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
     @cached_property
+    def joints(self) -> list[NDArray[np.float64]]:
+        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other."""
+        return [(1.0 * one - 1.0 * other)[self._original_cells] for one, other in self._patch.joints]
+
+    @cached_property
     def given(self) -> NDArray[np.int64]:
         """This rank's cells among the triangles that were given, see `PatchMesh.given`."""
         assert self._patch.given is not None

@@ -7,6 +7,7 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
 from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.parts.magnetism.interaction import Interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
@@ -34,6 +35,8 @@ class Loads:
         How strongly its magnetised parts act on each other; None if they do not.
     pairs
         What may touch: the shell itself, or parts of it.
+    joints
+        Which edges are joined.
     """
 
     pressure: bool = False
@@ -50,6 +53,7 @@ class Loads:
     sensors: tuple[Sensor, ...] = ()
     interaction: Interaction | None = None
     pairs: tuple[Pair, ...] = ()
+    joints: tuple[Joint, ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -60,6 +60,7 @@ ACCOUNTS = (  # modules here with a function `account`, in the order of `magshel
     "supports.reacting",
     "bodies.standing",
     "touching.section",
+    "joints",
 )
 
 

@@ -39,6 +39,7 @@ from magshell_fenicsx.parts.forces.dead_load import (
     point_entries,
     vertex_normal,
 )
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
@@ -150,8 +151,9 @@ class ShellModel(Thin):
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
         carrier = on_surface(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
+        creases = Creases.of(loads.joints, midsurface) if loads.joints else None
         pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed)
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, creases=creases)
         interior = factory.term(factory.interior_edges())
         terms: list[Term] = [factory.term(factory.membrane()), factory.term(factory.bending()), interior]
         held: list[Constraint] = []

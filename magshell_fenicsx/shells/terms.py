@@ -40,6 +40,7 @@ from magshell_fenicsx.parts.bodies.contact import (
     thinned_energy,
 )
 from magshell_fenicsx.parts.bodies.thinning import thinning
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
@@ -71,6 +72,8 @@ class EnergyFactory:
         The edges that hold the normal, and those on mirror planes, whose energies were made.
     pressed
         Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for 1.
+    creases
+        Joints with springs or hinges.
     """
 
     carrier: Carrier
@@ -85,6 +88,7 @@ class EnergyFactory:
     fields: list[AppliedField] = field(default_factory=list)
     held: list[HeldEdge] = field(default_factory=list)
     pressed: fem.Function | None = None
+    creases: Creases | None = None
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
@@ -123,6 +127,7 @@ class EnergyFactory:
     def interior_edges(self) -> Energy:
         of = edges.folded if self.folded else edges.interior
         density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
+        density = self.creases.added(density) if self.creases else density
         return self.carrier.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:

@@ -34,7 +34,7 @@ class PlacedFactor:
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or such a function (1 in the rest).
+    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a function (1 in the rest).
 
     `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in place of it, which is
     `carried` in the cells of a model.

@@ -78,12 +78,14 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     """
     if not given:
         return
-    seen = set[frozenset[str]]()
+    seen, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
     for i, pair in enumerate(given):
         if frozenset(pair) in seen:
             raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
         seen.add(frozenset(pair))
         for name in pair:
+            if shells and name not in (WHOLE, *shells) and not name.startswith(tuple(f"{each}_" for each in shells)):
+                raise ValueError(f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}")
             if name != WHOLE and not isinstance(context.shell, MeshSurface):
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
     if len(seen) > 1 and frozenset({WHOLE}) in seen:

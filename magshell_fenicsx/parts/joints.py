@@ -1,0 +1,183 @@
+"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a rotational spring, as creases are.
+
+The vertices of both edges are glued, so that displacements agree. What is left is the energy of the edge between two
+cells, which C0 interior penalty has on every one: of a rigid joint it is that, of a hinge there is none, and of a
+spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle theta between the normals.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import radians
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.parts.part import Account, Context
+
+if TYPE_CHECKING:
+    from dolfinx import fem
+
+    from magshell_fenicsx.mesh.midsurface import Midsurface
+    from magshell_fenicsx.models.shell.energy import Density
+    from magshell_fenicsx.parts.loads import Loads
+
+
+class JointSection(Section):
+    """Two edges that meet, joined."""
+
+    edges: Annotated[list[str], Field(min_length=2, max_length=2)]
+    """Both, each with the name of its shell: [upper.rim, lower.rim]"""
+    kind: Literal["rigid", "hinge", "spring"] = "rigid"
+    """The angle between the shells stays, is free, or has a spring"""
+    stiffness: Annotated[float, or_number("newton"), Field(ge=0, le=1e30)] | None = None
+    """Of kind: spring: moment per length and radian [force]"""
+    angle: float | None = Field(default=None, ge=-179, le=179)
+    """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded towards their
+    normals. By default that of the shells where they are [degree]"""
+
+    @model_validator(mode="after")
+    def _of_a_spring(self) -> Self:
+        if (self.stiffness is not None) != (self.kind == "spring"):
+            raise ValueError(f"stiffness belongs to kind: spring, and must be given there; the kind is {self.kind}")
+        if self.angle is not None and self.kind != "spring":
+            raise ValueError(f"angle: belongs to kind: spring; the kind is {self.kind}")
+        return self
+
+
+Joints = Annotated[list[JointSection], Field(max_length=100)]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint in a model.
+
+    Attributes
+    ----------
+    rigid
+        Whether the edge is as one within a shell; else it is a spring.
+    stiffness
+        Moment per length and radian over E h R; 0 of a hinge.
+    angle
+        At which the spring rests (rad); None for that of the placement.
+    """
+
+    edges: tuple[str, str]
+    rigid: bool
+    stiffness: float = 0.0
+    angle: float | None = None
+
+
+def joints(sections: Sequence[JointSection], context: Context) -> tuple[Joint, ...]:
+    """What a case's joints are in a model."""
+    scales = context.scales if any(section.stiffness for section in sections) else None
+    return tuple(
+        Joint(
+            (section.edges[0], section.edges[1]),
+            section.kind == "rigid",
+            (section.stiffness or 0.0) / (scales.E * scales.h * scales.R) if scales else 0.0,
+            None if section.angle is None else radians(section.angle),
+        )
+        for section in sections
+    )
+
+
+def refuse_unfit_joints(sections: Sequence[JointSection], context: Context) -> None:
+    """See that a model can have these joints.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    if not sections:
+        return
+    if not context.sections.get("shells"):
+        raise ValueError("joints: join edges of several shells: give shells")
+    if context.solid:
+        raise ValueError("joints: are of shells: take model: shell")
+    if context.shell.viscosity is not None or context.shell.relaxation:
+        raise ValueError("joints: with viscosity or relaxation they are not built: leave these out")
+    taken = set[str]()
+    for i, section in enumerate(sections):
+        if section.stiffness:
+            context.has_modulus(f"joints.{i}.stiffness")
+        for name in section.edges:
+            if name in taken:
+                raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")
+            taken.add(name)
+
+
+def account(context: Context, loads: "Loads") -> Account:
+    """Which edges are joined."""
+    return Account([_words(joint) for joint in loads.joints])
+
+
+def _words(joint: Joint) -> str:
+    kind = "rigidly" if joint.rigid else "by a hinge"
+    if joint.stiffness:
+        kind = f"by a spring, stiffness over E h R {joint.stiffness:.4g}"
+    return f"{' and '.join(joint.edges)} joined {kind}"
+
+
+@dataclass(frozen=True)
+class Creases:
+    """The edges between cells at which springs and hinges are.
+
+    Attributes
+    ----------
+    marks
+        (n,) in each cell: of each joint 1 beside its one edge, -1 beside the other, 0 elsewhere.
+    stiffness, sine, cosine
+        (n,) of each; the last two of the angle at which it rests, zero where that is the placement's.
+    """
+
+    marks: "fem.Function"
+    stiffness: "fem.Constant"
+    sine: "fem.Constant"
+    cosine: "fem.Constant"
+
+    @classmethod
+    def of(cls, joints: Sequence[Joint], midsurface: "Midsurface") -> "Creases | None":
+        """Those of some joints; None if all are rigid."""
+        import numpy as np
+        from dolfinx import fem
+
+        some = [(joint, of) for joint, of in zip(joints, midsurface.joints, strict=True) if not joint.rigid]
+        if not some:
+            return None
+        Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))
+        marks = fem.Function(Q, name="joints")
+        marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack([of for _, of in some])
+        rest = [(0.0, 0.0) if j.angle is None else (np.sin(j.angle), np.cos(j.angle)) for j, _ in some]
+        numbers = ([j.stiffness for j, _ in some], *zip(*rest, strict=True))
+        return cls(marks, *(fem.Constant(midsurface.mesh, np.array(each)) for each in numbers))
+
+    def added(self, density: "Density") -> "Density":
+        """The density of edges between cells, with springs in its place at joints."""
+        import ufl
+
+        from magshell_fenicsx.models.shell import kinematics as kin
+        from magshell_fenicsx.models.shell.edges import fold_angle
+
+        count = self.marks.ufl_shape[0]
+
+        def of(*arguments: Any, **known: Any) -> Any:
+            *given, (plus, minus), k, sine0, cosine0 = arguments
+            r0, u, m = given[:3]
+            within, springs, joined = density.of(*given, **known), 0, 0
+            stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
+            first = fold_angle(*r0, m[0])
+            sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+            for i in range(count):
+                product = plus[i] * minus[i]
+                here = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
+                placed = 1 - sine0[i] ** 2 - cosine0[i] ** 2  # 1 where it rests as it is placed
+                s0, c0 = sine0[i] + placed * first[0], cosine0[i] + placed * first[1]
+                turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
+                springs += here * k[i] / 2 * turned**2 * stretch
+                joined += here
+            return (1 - joined) * within + springs
+
+        more = (self.marks, self.stiffness, self.sine, self.cosine)
+        return replace(density, of=of, parameters=(*density.parameters, *more))
