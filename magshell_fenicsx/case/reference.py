@@ -82,6 +82,7 @@ def schema() -> dict[str, Any]:
     whole["properties"] = dict(
         sorted(whole["properties"].items(), key=lambda item: item[0] in PARTS)
     )  # parts come last
+    whole["anyOf"] = [{"required": whole.pop("required")}, {"required": ["shells"]}]
     return {**head, **whole}
 
 

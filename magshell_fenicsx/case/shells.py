@@ -160,7 +160,7 @@ class Several:
             ratio, own = self.ratio(part), part.case.problem().thickness
             factors[part.name] = ratio
             if own and own.of_position:
-                factors[part.name] = PlacedFactor(own.of_position, self.place(part), ratio)
+                factors[part.name] = PlacedFactor(own, self.place(part), ratio)
             for name, factor in ((own and own.patches) or {}).items():
                 factors[f"{part.name}_{name}"] = ratio * factor
         return None if all(factor == 1.0 for factor in factors.values()) else Thickness(patches=factors)
@@ -298,7 +298,9 @@ def _merged(parts: Sequence[Part]) -> Keys:
         if other.with_units != shell.with_units:
             one, none = (first.name, part.name) if shell.with_units else (part.name, first.name)
             raise ValueError(
-                part.refused(f"shell: lengths of {one} have units and those of {none} have none: give all one, or none")
+                part.refused(
+                    f"shell: lengths of {one} have units and those of {none} none: give all of them one, or none"
+                )
             )
         if other.laminate:
             raise ValueError(part.refused("shell.laminate: is of one shell alone: leave it out"))

@@ -5,15 +5,19 @@ cells, which C0 interior penalty has on every one: of a rigid joint it is that, 
 spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle theta between the normals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:
     from dolfinx import fem
@@ -21,6 +25,8 @@ if TYPE_CHECKING:
     from magshell_fenicsx.mesh.midsurface import Midsurface
     from magshell_fenicsx.models.shell.energy import Density
     from magshell_fenicsx.parts.loads import Loads
+
+AMPLITUDE = "fold"
 
 
 class JointSection(Section):
@@ -34,7 +40,8 @@ class JointSection(Section):
     """Of kind: spring: moment per length and radian [force]"""
     angle: float | None = Field(default=None, ge=-179, le=179)
     """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded towards their
-    normals. By default that of the shells where they are [degree]"""
+    normals. By default that of the shells where they are; else it grows from there before the load, or as a step of
+    kind: fold [degree]"""
 
     @model_validator(mode="after")
     def _of_a_spring(self) -> Self:
@@ -120,6 +127,65 @@ def _words(joint: Joint) -> str:
     return f"{' and '.join(joint.edges)} joined {kind}"
 
 
+class FoldStep(PathStep):
+    """The angles at which springs of joints rest grow from those of the shells where they are (0) to their own (1)."""
+
+    amplitude: ClassVar[str] = AMPLITUDE
+    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(AMPLITUDE, "fold", "How far the rest angles of joints have grown to those of the case.", "load"),
+    )
+    kind: Literal["fold"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    factor: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of the factor, 1 by default"""
+
+    @property
+    def _end(self) -> float | None:
+        return 1.0
+
+    @classmethod
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        driven = loading is not None and loading.amplitude == cls.amplitude
+        return [] if driven or not rests_elsewhere(context) else [("joints", FoldBefore(kind="fold"))]
+
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if not rests_elsewhere(context):
+            raise ValueError(f"{step.key}.kind: fold: needs a joint with an angle")
+
+
+class FoldBefore(FoldStep):
+    """The growth before the one load of a case; it ends at the first instability."""
+
+    def drive(self, now: Now) -> Drive:
+        return Drive("arc", "load", 1.0, [1.0], 0.5, 1.0)
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            return (
+                f"the springs of joints alone make the shells unstable at {mu[AMPLITUDE]:.9g} of their angles "
+                f"({what}): to go on, take these as a load, kind: fold"
+            )
+
+        return replace(course, until="limit", forbidden=forbidden)
+
+
+def rests_elsewhere(context: Context) -> bool:
+    """Whether a spring has an angle of its own."""
+    return any(section.angle is not None for section in context.sections.get("joints") or ())
+
+
+class FoldSeen(Seen):
+    """How far the angles have grown."""
+
+    def named(self, loads: "Loads") -> Sequence[str]:
+        return (AMPLITUDE,) if any(joint.angle is not None for joint in loads.joints) else ()
+
+
 @dataclass(frozen=True)
 class Creases:
     """The edges between cells at which springs and hinges are.
@@ -128,14 +194,14 @@ class Creases:
     ----------
     marks
         (n,) in each cell: of each joint 1 beside its one edge, -1 beside the other, 0 elsewhere.
-    stiffness, sine, cosine
-        (n,) of each; the last two of the angle at which it rests, zero where that is the placement's.
+    stiffness, angle, given
+        (n,) of each: the angle at which it rests where the last is 1, else 0 and the placement's.
     """
 
     marks: "fem.Function"
     stiffness: "fem.Constant"
-    sine: "fem.Constant"
-    cosine: "fem.Constant"
+    angle: "fem.Constant"
+    given: "fem.Constant"
 
     @classmethod
     def of(cls, joints: Sequence[Joint], midsurface: "Midsurface") -> "Creases | None":
@@ -149,21 +215,25 @@ class Creases:
         Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))
         marks = fem.Function(Q, name="joints")
         marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack([of for _, of in some])
-        rest = [(0.0, 0.0) if j.angle is None else (np.sin(j.angle), np.cos(j.angle)) for j, _ in some]
-        numbers = ([j.stiffness for j, _ in some], *zip(*rest, strict=True))
-        return cls(marks, *(fem.Constant(midsurface.mesh, np.array(each)) for each in numbers))
+        numbers = [(j.stiffness, j.angle or 0.0, float(j.angle is not None)) for j, _ in some]
+        return cls(marks, *(fem.Constant(midsurface.mesh, np.array(each)) for each in zip(*numbers, strict=True)))
 
-    def added(self, density: "Density") -> "Density":
-        """The density of edges between cells, with springs in its place at joints."""
+    @property
+    def grow(self) -> bool:
+        """Whether an angle grows."""
+        return bool(self.given.value.any())
+
+    def added(self, density: "Density", factor: "fem.Constant") -> "Density":
+        """The density of edges between cells, with springs in its place at joints, whose angles have grown so far."""
         import ufl
 
         from magshell_fenicsx.models.shell import kinematics as kin
         from magshell_fenicsx.models.shell.edges import fold_angle
 
-        count = self.marks.ufl_shape[0]
+        count, grow = self.marks.ufl_shape[0], self.grow
 
         def of(*arguments: Any, **known: Any) -> Any:
-            *given, (plus, minus), k, sine0, cosine0 = arguments
+            *given, (plus, minus), k, angle, has, grown = arguments
             r0, u, m = given[:3]
             within, springs, joined = density.of(*given, **known), 0, 0
             stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
@@ -172,12 +242,15 @@ class Creases:
             for i in range(count):
                 product = plus[i] * minus[i]
                 here = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
-                placed = 1 - sine0[i] ** 2 - cosine0[i] ** 2  # 1 where it rests as it is placed
-                s0, c0 = sine0[i] + placed * first[0], cosine0[i] + placed * first[1]
+                s0, c0 = first
+                if grow:
+                    placed = ufl.atan2(*first)
+                    rest = placed + grown * has[i] * (angle[i] - placed)
+                    s0, c0 = ufl.sin(rest), ufl.cos(rest)
                 turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
                 springs += here * k[i] / 2 * turned**2 * stretch
                 joined += here
             return (1 - joined) * within + springs
 
-        more = (self.marks, self.stiffness, self.sine, self.cosine)
+        more = (self.marks, self.stiffness, self.angle, self.given, factor)
         return replace(density, of=of, parameters=(*density.parameters, *more))

@@ -36,8 +36,14 @@ KINDS_OF_STEPS: dict[str, str] = {
     "time": "motion.step.TimeSection",
     "spin": "spin.SpinStep",
     "interaction": "magnetism.interaction.InteractionStep",
+    "fold": "joints.FoldStep",
 }
-FIRST = ("natural", "interaction", "field")  # the kinds of steps that may come before the one load, in their order
+FIRST = (
+    "natural",
+    "fold",
+    "interaction",
+    "field",
+)  # the kinds of steps that may come before the one load, in their order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
@@ -51,6 +57,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
     "touching.seen.TouchingSeen",
+    "joints.FoldSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",

@@ -40,6 +40,7 @@ from magshell_fenicsx.parts.bodies.contact import (
     thinned_energy,
 )
 from magshell_fenicsx.parts.bodies.thinning import thinning
+from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
@@ -127,7 +128,9 @@ class EnergyFactory:
     def interior_edges(self) -> Energy:
         of = edges.folded if self.folded else edges.interior
         density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
-        density = self.creases.added(density) if self.creases else density
+        if self.creases:
+            zero = self._constant(0.0)
+            density = self.creases.added(density, self.free.setdefault(FOLD, zero) if self.creases.grow else zero)
         return self.carrier.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:

@@ -21,18 +21,6 @@ LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 
 
 @dataclass(frozen=True)
-class PlacedFactor:
-    """A function of x, y, z of a shell that has a place, times a number: (..., 3) -> (...)."""
-
-    of_position: Callable[[Array, Array, Array], Array]
-    place: Place
-    times: float
-
-    def __call__(self, x: Array) -> Array:
-        return np.asarray(self.times * self.of_position(*np.moveaxis(self.place.own(x), -1, 0)))
-
-
-@dataclass(frozen=True)
 class Thickness:
     """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a function (1 in the rest).
 
@@ -41,7 +29,7 @@ class Thickness:
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
-    patches: Mapping[str, float | PlacedFactor] | None = None
+    patches: "Mapping[str, float | PlacedFactor] | None" = None
     formulas: Together | None = None
     given: GivenField | None = None
     carried: Carried | None = None
@@ -67,6 +55,20 @@ class Thickness:
             formulas=self.formulas,
         )
         return fit.nodal[..., 0]
+
+
+@dataclass(frozen=True)
+class PlacedFactor:
+    """The thickness of a shell that has a place, times a number."""
+
+    own: Thickness
+    place: Place
+    times: float
+
+    def in_cells(self, cells: Cells) -> Array:
+        """Its values (cells, nodes) in cells in space; collective."""
+        there = replace(cells, nodal=self.place.own(cells.nodal))
+        return self.times * self.own.shown(there, self.own.at(there.nodal))
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
@@ -106,8 +108,13 @@ def thickness_field(
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
-        values[inside] = factor(nodes[inside]) if isinstance(factor, PlacedFactor) else factor
+        values[inside] = factor.in_cells(some(cells_of(r0), inside)) if isinstance(factor, PlacedFactor) else factor
     return nodal_thickness(values, nodes, V)
+
+
+def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
+    """Some of this rank's cells."""
+    return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
 
 
 def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Function:
