@@ -38,12 +38,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "interaction": "magnetism.interaction.InteractionStep",
     "fold": "joints.FoldStep",
 }
-FIRST = (
-    "natural",
-    "fold",
-    "interaction",
-    "field",
-)  # the kinds of steps that may come before the one load, in their order
+FIRST = ("natural", "fold", "interaction", "field")  # kinds of steps that may come before the one load, in order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
