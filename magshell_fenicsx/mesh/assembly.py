@@ -145,11 +145,11 @@ def together(members: Sequence[Member]) -> PatchMesh:
         one.append((np.arange(count) if patch.one is None else patch.one) + first)
         edges |= {f"{member.name}_{name}": pairs + first for name, pairs in patch.edges.items()}
         points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in member.points}
-        inside = {member.name: np.ones(len(patch.cells), dtype=bool)}
-        inside |= {f"{member.name}_{name}": of for name, of in patch.patches.items()}
-        for name, of in inside.items():
-            patches[name] = np.zeros(total, dtype=bool)
-            patches[name][begin : begin + len(patch.cells)] = of
+        every = np.ones(len(patch.cells), dtype=bool)
+        for name, of in {"": every, **patch.patches}.items():
+            inside = np.zeros(total, dtype=bool)
+            inside[begin : begin + len(patch.cells)] = of
+            patches[f"{member.name}_{name}" if name else member.name] = inside
         first, begin = first + count, begin + len(patch.cells)
     given = np.column_stack([np.arange(total), np.zeros(total, dtype=np.int64)])
     return PatchMesh(
@@ -194,9 +194,9 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     for name in edges:
         if name not in patch.edges:
             raise MeshError(f"{key}: {name}: there is no such edge, only {', '.join(patch.edges)}")
-    kept, away = (patch.nodes[np.unique(patch.edges[name]), :3] for name in edges)
-    patch, unmet = _divided(patch, edges[0], away)
-    patch, other = _divided(patch, edges[1], kept)
+    places_on = [patch.nodes[np.unique(patch.edges[name]), :3] for name in edges]
+    patch, unmet = _divided(patch, edges[0], places_on[1])
+    patch, other = _divided(patch, edges[1], places_on[0])
     far, at = max(unmet, other, key=lambda each: each[0])
     if far > MEET * float(np.ptp(patch.nodes[:, :3], axis=0).max()):
         raise MeshError(
