@@ -29,6 +29,7 @@ NEARLY = 1e-5  # of a side: a place so near to its end is there
 ROUNDS = 40  # of the search for the nearest place of a side
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 SIDES = np.array([[0, 1], [1, 2], [2, 0]])
+CHART = 2  # numbers of a node of a chart
 OWN = 6  # most numbers of a node of its own: place and normal, in a mesh file
 
 
@@ -73,6 +74,11 @@ class Embedded:
     """Nodes (n, 10) of an assembly -> places (n, 3), by the shell of each."""
 
     embeddings: tuple[tuple[Embedding, int, Place], ...]
+
+    @property
+    def charts(self) -> bool:
+        """Whether all shells have charts, and none is from a mesh file."""
+        return all(size == CHART for _, size, _ in self.embeddings)
 
     def __call__(self, nodes: Array) -> Array:
         number, found = np.rint(nodes[:, -1]), np.array(nodes[:, :3])

@@ -115,6 +115,12 @@ class Midsurface:
         """Whether it comes from a mesh file, and so may have facets or folds."""
         return self._patch.nodes.shape[1] != 2
 
+    @property
+    def kinked(self) -> bool:
+        """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and at joints."""
+        charts = getattr(self._patch.embedding, "charts", not self.read)
+        return bool(self._patch.joints) or not charts
+
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""

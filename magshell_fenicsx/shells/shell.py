@@ -148,7 +148,7 @@ class ShellModel(Thin):
             grown = loads.natural.on(midsurface.patches, count, lambda given: carried(given, midsurface, in_cells))
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
-        folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
+        folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD
         carrier = on_surface(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
         creases = Creases.of(loads.joints, midsurface) if loads.joints else None
