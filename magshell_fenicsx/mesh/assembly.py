@@ -229,8 +229,8 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
 
 def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tuple[float, Array]]:
     """With vertices on an edge at places (n, 3), and how far the farthest of these is from it, and where."""
-    pairs, corners = patch.edges[edge], patch.corners
-    of = {tuple(sorted(side)): (c, s) for c, cell in enumerate(corners) for s, side in enumerate(cell[SIDES])}
+    pairs, sides = patch.edges[edge], patch.corners[:, SIDES].tolist()
+    of = {tuple(sorted(side)): (c, s) for c, each in enumerate(sides) for s, side in enumerate(each)}
     cell, side = np.array([of[tuple(sorted(pair))] for pair in pairs]).T
     S, T = len(pairs), len(targets)
     start, end = CORNERS[SIDES[side]].transpose(1, 0, 2)

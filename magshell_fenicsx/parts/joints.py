@@ -237,14 +237,14 @@ class Creases:
             r0, u, m = given[:3]
             within, springs, joined = density.of(*given, **known), 0, 0
             stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
-            first = fold_angle(*r0, m[0])
+            first = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):
                 product = plus[i] * minus[i]
                 here = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
                 s0, c0 = first
                 if grow:
-                    placed = ufl.atan2(*first)
+                    placed = ufl.atan2(first[0], first[1])
                     rest = placed + grown * has[i] * (angle[i] - placed)
                     s0, c0 = ufl.sin(rest), ufl.cos(rest)
                 turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
