@@ -28,7 +28,7 @@ def forces(data: dict[str, Any], column: str) -> list[float]:
 
 @pytest.mark.slow
 def test_two_arches_and_a_plane() -> None:
-    """The force at approaches of 1, 2 and 4 h of each, 1e-3."""
+    """The force at approaches of h/2 and h of each, 1e-3."""
     top = {"position": [0, 2 + 1.0001 * h, 0], "turn": 180}
     move = {"supports": ["upper.left", "upper.right"], "translation": [0, -2 * h, 0]}
     both = {
@@ -37,7 +37,7 @@ def test_two_arches_and_a_plane() -> None:
             "upper": {"shell": ARCH, "boundary": HELD, "place": top},
         },
         "contact": [["upper", "lower"]],
-        "loading": [{"kind": "edge", "moves": [move], "factor": f, "points": 1} for f in (1, 2, 4)],
+        "loading": [{"kind": "edge", "moves": [move], "factor": f, "points": 1} for f in (0.5, 1)],
     }
     plane = {"kind": "plane", "at": {"point": [0, 1, 0.06]}}
     one = {
@@ -45,6 +45,6 @@ def test_two_arches_and_a_plane() -> None:
         "boundary": HELD,
         "symmetry": "none",
         "bodies": {"plane": plane},
-        "loading": [{"kind": "contact", "body": "plane", "approach": f, "points": 1} for f in (1, 2, 4)],
+        "loading": [{"kind": "contact", "body": "plane", "approach": f, "points": 1} for f in (0.5, 1)],
     }
     assert forces(both, "contact_force") == pytest.approx(forces(one, "force"), rel=1e-3)
