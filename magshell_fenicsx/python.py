@@ -43,6 +43,9 @@ class Shell:
         The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
     unit
         Of a mesh: the unit of its coordinates where the thickness has one; by default the metre.
+    name, place, points
+        Of one of several shells: the name before its edges and points, `upper.rim`; and where it is and its named
+        points, as a case has them under `shells`.
     keys
         What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
         `thickness_factor`, a formula of the place over R or a function, is that of each place.
@@ -63,9 +66,13 @@ class Shell:
         cell_tags: mesh.MeshTags | None = None,
         radius: float | str | None = None,
         unit: str | None = None,
+        name: str | None = None,
+        place: Mapping[str, Any] | None = None,
+        points: Mapping[str, Sequence[Any]] | None = None,
         **keys: Any,
     ) -> None:
         self.home: Home | None = None
+        self.name, self._own = name, {"place": place, "points": points}
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
         if isinstance(surface, str):
@@ -86,6 +93,11 @@ class Shell:
         if radius is None:
             half = float(np.ptp(triangles.nodes, axis=0).max()) / 2
             self._keys["radius"] = f"{half!r} {unit or 'm'}" if measured else half
+
+    def one_of_several(self) -> Keys:
+        """What a case has under `shells` and its name."""
+        own = {key: self.plain(value, key) for key, value in self._own.items() if value is not None}
+        return {"shell": self.section(), "boundary": {}, **own}
 
     def section(self) -> Keys:
         """What a case has under `shell`."""
@@ -232,7 +244,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
 
 
 def Problem(
-    shell: Shell,
+    shell: Shell | Sequence[Shell],
     *parts: Piece | OwnTerm,
     points: Mapping[str, Sequence[Any]] | None = None,
     degree: int | None = None,
@@ -243,6 +255,8 @@ def Problem(
 
     Parameters
     ----------
+    shell
+        What is computed; or several, each with a name: `Clamped("upper.rim")` then holds the rim of `upper`.
     parts
         Supports, fields, steps and other sections, and one's own energies. The steps are a programme in this order;
         before a single one the natural shape grows and the field is applied.
@@ -260,9 +274,14 @@ def Problem(
     CaseError, MeshError
         One message with every mistake; on every rank.
     """
+    several = list(shell) if isinstance(shell, list | tuple) else []
+    if several:
+        shell = several[0]
+        _refuse_unfit_shells(several)
     if not isinstance(shell, Shell):
         raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    data: Keys = {"shell": shell.section(), "boundary": {}, **shell.plain(sections, "case")}
+    own = {"shells": {each.name: each.one_of_several() for each in several}} if several else {"shell": shell.section()}
+    data: Keys = {**own, "boundary": {}, **shell.plain(sections, "case")}
     steps, terms = list[Keys](), list[OwnTerm]()
     for part in parts:
         if isinstance(part, OwnTerm):
@@ -278,11 +297,42 @@ def Problem(
     if steps:
         data["loading"] = steps[0] if len(steps) == 1 else steps
     _join(data, "points", shell.plain(points or {}, "points"))
+    if several:
+        _distribute(data)
     if degree is not None:
         _join(data, "mesh", {"degree": degree})
     if symmetry or shell.home:
         data["symmetry"] = symmetry or "none"
     return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
+
+
+def _refuse_unfit_shells(several: Sequence[Any]) -> None:
+    for each in several:
+        if not isinstance(each, Shell) or not each.name:
+            raise CaseError(f"{NAME}: {each!r}: of several shells each is what ms.Shell gives, with a name")
+        if each.home:
+            raise CaseError(f"{NAME}: {each.name}: of several shells each has a geometry: write its mesh to a file")
+    names = [each.name for each in several]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise CaseError(f"{NAME}: {twice}: two shells have this name")
+
+
+def _distribute(data: Keys) -> None:
+    """Give each of several shells its own of what is held and named.
+
+    Raises
+    ------
+    CaseError
+        If a name does not begin with that of a shell and a dot.
+    """
+    for key in ("boundary", "points"):
+        for name, value in data.pop(key).items():
+            shell, dot, own = name.partition(".")
+            if not dot or shell not in data["shells"]:
+                raise CaseError(
+                    f"{NAME}: {key}.{name}: begins with the name of a shell: {next(iter(data['shells']))}.rim"
+                )
+            _join(data["shells"][shell], key, {own: value})
 
 
 def _join(data: Keys, key: str, more: Keys) -> None:

@@ -61,6 +61,7 @@ class Projection:
         self._first = index.local_range[0]
         self._by_node: PETSc.Mat | None = None
         self._K: PETSc.Mat | None = None
+        self._of: PETSc.Mat | None = None  # kept, so that no other matrix has its handle
 
     def project(self, u: Array) -> None:
         """Project a vector of owned nodes, with or without ghosts, in place."""
@@ -69,10 +70,12 @@ class Projection:
         x[nodes] = np.einsum("nij,nj->ni", self._P[here], x[nodes])
 
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
-        """P K P + (I - P); always the same object. Collective."""
+        """P K P + (I - P); the same object while K is the same, which contact makes another. Collective."""
         if self._by_node is None:
             self._by_node, self._rest = self._blocks(self._P, 1.0), self._blocks(np.eye(3) - self._P, 0.0)
-        self._K = K.ptap(self._by_node, self._K)
+        same = self._of is not None and self._of.handle == K.handle
+        self._K = K.ptap(self._by_node, self._K if same else None)
+        self._of = K
         self._K.axpy(1.0, self._rest, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
             self._K.setOption(option, True)

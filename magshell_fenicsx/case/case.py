@@ -1,15 +1,25 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
 
-from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
+from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
+from magshell_fenicsx.case.shells import Several, Shells, expanded, written
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, texts
@@ -17,6 +27,7 @@ from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.joints import Joints
 from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
@@ -41,28 +52,6 @@ if TYPE_CHECKING:
 Waves = Annotated[int, Field(ge=1, le=200)]
 
 
-def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
-    """See that a shell has the patches of a key; a mesh file knows its own later.
-
-    Parameters
-    ----------
-    dimples
-        Names of the patches within the rims of the shell's dimples.
-
-    Raises
-    ------
-    ValueError
-        If it has not.
-    """
-    if isinstance(shell, MeshSurface):
-        return
-    if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
-        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
-    known = [*(dimples or ["dimple"]), "rest"]
-    if unknown := set(patches) - set(known):
-        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")
-
-
 class Case(WithParts):
     """A shell, what holds it, its field and its load; validated."""
 
@@ -76,6 +65,10 @@ class Case(WithParts):
     """What is held"""
     points: dict[str, Coordinates] = Field(default_factory=dict)
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
+    shells: Shells | None = None
+    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. The R of the
+    first is that of formulas and results, its thickness the h of these; all have one material. The edge or point `rim`
+    of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
@@ -86,7 +79,9 @@ class Case(WithParts):
     """Name -> rigid body that presses on the shell, or stands in its way"""
     contact: Pairs = Field(default=[])
     """Pairs that may touch, half a thickness from their mid-surfaces, without friction: [[shell, shell]] is the shell
-    with itself; in place of `shell` the name of a patch of a mesh file"""
+    with itself; in place of `shell` the name of one of several shells, or of a patch of a mesh file"""
+    joints: Joints = Field(default=[])
+    """Edges of several shells that meet, and how they are joined"""
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
@@ -114,10 +109,27 @@ class Case(WithParts):
     (axisymmetric), or for a number m the sector of 180/m degrees between two mirror planes through e3, which waves
     cos(mφ) have; 1 is a half"""
 
+    _several: Several | None = PrivateAttr(default=None)
+
+    @property
+    def several(self) -> Several | None:
+        """The shells of a case that has several."""
+        return self._several
+
+    @model_serializer(mode="wrap")
+    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return written(handler(self), self.shells)
+
     @model_validator(mode="wrap")
     @classmethod
-    def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _units_go_with_those_of_the_shell(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        data, several = expanded(data, info.context, cls)
         section = handler(data)
+        if several and isinstance(section.shell, MeshSurface):
+            section._several = several
+            section.shell.files.given[section.shell.path] = several.assembly
         if isinstance(data, dict) and not section.shell.with_units:
             parts = {key: data.get(key) for key in ("mesh", *PARTS)} | _places(data)
             written = listed(data.get("loading"))
@@ -162,7 +174,8 @@ class Case(WithParts):
     def _model_fits(self) -> Self:
         read = isinstance(self.shell, MeshSurface)
         for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}) if read else []:
-            raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
+            if not self.several:
+                raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
         if self.model == "shell":
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
@@ -261,6 +274,7 @@ class Case(WithParts):
             "magnetic.remanent": self.remanent,
         }
         sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        sections |= self.several.readers if self.several else {}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod

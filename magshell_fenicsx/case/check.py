@@ -90,7 +90,7 @@ def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
     """The edges at which a live pressure has no potential."""
     span = problem.meridian
     if span is None:
-        return open_edges(patch or problem.triangulated(), problem.conditions)
+        return open_edges(patch or problem.triangulated(), problem.conditions, problem.loads.pressed)
     places = span.sample()[[0, -1]][:, [0, 2]]
     ends = {name: np.asarray(place) for name, place in zip(span.names, places, strict=True) if name}
     return ring_openings(ends, problem.conditions)[1]

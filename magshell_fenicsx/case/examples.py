@@ -48,7 +48,7 @@ def _text(file: Path) -> str:
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
     """The case, and the mesh file that it names or the data of its name, which come to stand beside it."""
-    text, mesh = _text(source), read_source(source).data["shell"].get("file")
+    text, mesh = _text(source), (read_source(source).data.get("shell") or {}).get("file")
     data = source.with_suffix(".csv")
     if data.exists():
         return {target: text.encode(), target.with_suffix(".csv"): data.read_bytes()}

@@ -1,6 +1,6 @@
-"""The programme of a case: its steps with their numbers and amplitudes, and what all must have in common."""
+"""The programme of a case: its steps with their numbers and amplitudes, what all must have in common, and patches."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag
@@ -10,6 +10,7 @@ from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
+from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 
 if TYPE_CHECKING:
     OneStep: TypeAlias = Step
@@ -92,3 +93,25 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
             raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")
         if how == "conjugate" and load is not None and load.released and (step.load.in_time or step.load.released_by):
             raise ValueError(f"{key}: conjugate: {load.released}")
+
+
+def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
+    """See that a shell has the patches of a key; a mesh file knows its own later.
+
+    Parameters
+    ----------
+    dimples
+        Names of the patches within the rims of the shell's dimples.
+
+    Raises
+    ------
+    ValueError
+        If it has not.
+    """
+    if isinstance(shell, MeshSurface):
+        return
+    if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
+        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
+    known = [*(dimples or ["dimple"]), "rest"]
+    if unknown := set(patches) - set(known):
+        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")

@@ -5,6 +5,7 @@ On several ranks a file is as rank 0 reads it. A run writes down what its case s
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,6 +17,8 @@ from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.sizes import MeshSection
+
+OF_SHELLS = ("shells", "shell", "boundary", "points")  # what the data of several shells make
 
 
 def opened(case: Case | Mapping[str, Any] | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Case:
@@ -87,23 +90,48 @@ def changed(case: Case, values: Mapping[str, Any]) -> Case:
 
 def _changed(case: Case, key: str, value: Any) -> Case:
     written = case.origin.data
+    if case.several and key.split(".")[0] in ("shells", "mesh"):  # all of them are meshed anew
+        return _of_data(case, key, value)
     replaced: Case = _replaced(case, key, value)
     if written is None or not key.startswith("shell."):  # no other number is one that others are given over
         return replaced
-    data = deepcopy(written)
+    other = _validated(_written(written, key, value), case, key)
+    return replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+
+
+def _of_data(case: Case, key: str, value: Any) -> Case:
+    """A case of several shells with another value, from its data."""
+    if case.origin.data is None:
+        raise CaseError(f"{key}: needs a case that was read from a file or a mapping: see Case.from_source")
+    data = _written(case.origin.data, key, value)
+    made = _validated(data, case, key).with_terms(case.own_terms)
+    kept = {name: getattr(case, name) for name in type(case).model_fields if name not in OF_SHELLS}
+    kept["mesh"] = made.mesh
+    if "magnetic" in kept and any(section.remanent for section in (made.shells or {}).values()):
+        kept["magnetic"] = made.magnetic
+    again = made.model_copy(update=kept)
+    return again.written_as(replace(case.origin, data=data))
+
+
+def _written(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Plain data with another value, in the unit that the one before had."""
+    found = deepcopy(dict(data))
     *path, last = key.split(".")
-    part: Any = data
+    part: Any = found
     for name in path:
         part = part[int(name)] if isinstance(part, list) else part.setdefault(name, {})
     at: Any = int(last) if isinstance(part, list) else last
     known = part[at] if isinstance(part, list) else part.get(at)
     unit = number_and_unit(known)[1] if isinstance(known, str) else ""
     part[at] = f"{value / si_size(unit)!r} {unit}" if unit else value
+    return found
+
+
+def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:
     try:
-        other = Case.model_validate(data, context=case.origin.context)
+        return Case.model_validate(data, context=case.origin.context)
     except ValidationError as e:
         raise CaseError(f"{key}: {e.errors()[0]['msg'].removeprefix('Value error, ')}") from None
-    return replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
 
 
 def _replaced(part: Any, key: str, value: Any) -> Any:

@@ -359,6 +359,8 @@ def _turned(components: tuple[int, ...], turn: float) -> list[int]:
 
 
 def _thickness(case: Case, turn: float) -> Thickness | None:
+    if case.several:
+        return case.several.thickness
     factor = case.thickness_factor
     if isinstance(factor, dict):
         return Thickness(patches=factor)

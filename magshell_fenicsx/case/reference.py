@@ -82,6 +82,7 @@ def schema() -> dict[str, Any]:
     whole["properties"] = dict(
         sorted(whole["properties"].items(), key=lambda item: item[0] in PARTS)
     )  # parts come last
+    whole["anyOf"] = [{"required": whole.pop("required")}, {"required": ["shells"]}]
     return {**head, **whole}
 
 
@@ -191,7 +192,7 @@ def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
     lines = ["", f"## {title}", "", section["description"], ""]
     if section["properties"]:
         lines += ["| key | allowed | unit | default | meaning |", "| --- | --- | --- | --- | --- |"]
-        required = section.get("required", [])
+        required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
         keys = sorted(section["properties"].items(), key=lambda item: item[0] not in TAGS)  # what tells it apart first
         lines += [_row(key, value, key in required, titles) for key, value in keys]
     else:

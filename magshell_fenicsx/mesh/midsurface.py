@@ -120,10 +120,21 @@ class Midsurface:
         """Whether it comes from a mesh file, and so may have facets or folds."""
         return self._patch.nodes.shape[1] != 2
 
+    @property
+    def kinked(self) -> bool:
+        """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and at joints."""
+        charts = getattr(self._patch.embedding, "charts", not self.read)
+        return bool(self._patch.joints) or not charts
+
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
+
+    @cached_property
+    def joints(self) -> list[NDArray[np.float64]]:
+        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other."""
+        return [(1.0 * one - 1.0 * other)[self._original_cells] for one, other in self._patch.joints]
 
     @cached_property
     def given(self) -> NDArray[np.int64]:

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.midsurface import nodal_normals
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
@@ -149,7 +150,7 @@ NEAR = 1e-6  # distance, over the extent, up to which a vertex counts as a named
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A .msh file, or triangles that a program gives under that name.
+    """A .msh file, triangles that a program gives under that name, or several shells.
 
     Attributes
     ----------
@@ -160,14 +161,14 @@ class MeshFile:
     files
         What has its content.
     given
-        The triangles; None of a file.
+        The triangles or the shells; None of a file.
     """
 
     path: Path
     scale: float
     normals: bool = False
     files: Files = field(default_factory=Files, compare=False)
-    given: Triangles | None = None
+    given: Triangles | Assembly | None = None
 
     @property
     def home(self) -> "Home | None":
@@ -182,6 +183,7 @@ class MeshFile:
         MeshError
             If it cannot be read.
         """
+        assert not isinstance(self.given, Assembly)
         return self.given or _content(self)
 
 
@@ -214,12 +216,22 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
         If the file cannot be read, or its surface cannot carry a shell. Places in messages are
         those of the file.
     """
+    if isinstance(file.given, Assembly):
+        patch = file.given.patch
+        known = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
+        others = {name: x for name, x in points.items() if name not in known}
+        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale), **known})
     try:
         patch = _whole(file)
     except MeshError as e:
         raise MeshError(f"shell: {e}" if file.given else f"shell.file: {e}") from None
     patch = cut(patch, mirror) if mirror else patch
     return replace(patch, points=_vertices(patch.nodes, patch.cells, points, file.scale))
+
+
+def _alike(points: Mapping[str, Array], name: str) -> list[str]:
+    """The names of points at the place of one."""
+    return [other for other, x in points.items() if name in points and np.array_equal(x, points[name])]
 
 
 def _whole(file: MeshFile) -> PatchMesh:

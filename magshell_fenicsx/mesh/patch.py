@@ -139,6 +139,8 @@ class PatchMesh:
     given
         (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1 where it has been
         turned over; None without.
+    joints
+        Of each two edges that are glued: whether each triangle has one, and whether it has the other.
     """
 
     nodes: NDArray[np.float64]
@@ -149,6 +151,7 @@ class PatchMesh:
     one: NDArray[np.int64] | None = None
     patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     given: NDArray[np.int64] | None = None
+    joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]], ...] = ()
 
     @property
     def corners(self) -> NDArray[np.int64]:

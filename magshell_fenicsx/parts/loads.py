@@ -10,6 +10,7 @@ from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.bodies.contact import Contact
+    from magshell_fenicsx.parts.joints import Joint
     from magshell_fenicsx.parts.magnetism.interaction import Interaction
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
@@ -23,6 +24,8 @@ class Loads:
 
     Attributes
     ----------
+    pressed
+        Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
     growing
@@ -35,9 +38,12 @@ class Loads:
         How strongly its magnetised parts act on each other; None if they do not.
     pairs
         What may touch: the shell itself, or parts of it.
+    joints
+        Which edges are joined.
     """
 
     pressure: bool = False
+    pressed: Mapping[str, float] = field(default_factory=dict)
     forces: Mapping[str, Force] = field(default_factory=dict)
     magnetic: "Magnetisation | None" = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
@@ -50,6 +56,7 @@ class Loads:
     sensors: "tuple[Sensor, ...]" = ()
     interaction: "Interaction | None" = None
     pairs: "tuple[Pair, ...]" = ()
+    joints: "tuple[Joint, ...]" = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

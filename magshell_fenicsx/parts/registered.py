@@ -36,8 +36,9 @@ KINDS_OF_STEPS: dict[str, str] = {
     "time": "motion.step.TimeSection",
     "spin": "spin.SpinStep",
     "interaction": "magnetism.interaction.InteractionStep",
+    "fold": "joints.FoldStep",
 }
-FIRST = ("natural", "interaction", "field")  # the kinds of steps that may come before the one load, in their order
+FIRST = ("natural", "fold", "interaction", "field")  # kinds of steps that may come before the one load, in order
 
 ABILITIES = (  # module here and class in it, of those without a key and a line in REGISTERED
     "supports.boundary.BoundarySection",
@@ -50,6 +51,7 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "motion.history.Viscosity",
     "bodies.body.RigidBodies",
     "touching.section.ShellContact",
+    "joints.Joined",
 )
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
@@ -64,6 +66,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "magnetism.readings.SensorsSeen",
     "bodies.press.BodiesSeen",
     "touching.seen.TouchingSeen",
+    "joints.FoldSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
@@ -73,6 +76,7 @@ ACCOUNTS = (  # modules here with a function `account`, in the order of `magshel
     "supports.reacting",
     "bodies.standing",
     "touching.section",
+    "joints",
 )
 
 

@@ -88,9 +88,13 @@ def _refuse_ambiguous(edges: Collection[str], points: Collection[str], condition
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
 
 
-def open_edges(patch: PatchMesh, conditions: Mapping[str, Condition]) -> tuple[str, ...]:
-    """The edges at which a live pressure has no potential."""
+def open_edges(patch: PatchMesh, conditions: Mapping[str, Condition], on: Collection[str] = ()) -> tuple[str, ...]:
+    """The edges at which a live pressure has no potential; `on` are the patches that it acts on, all without."""
     sides = {name: {(int(a), int(b)) for a, b in np.sort(edge, axis=1)} for name, edge in patch.edges.items()}
+    if on:
+        inside = np.logical_or.reduce([patch.patches[name] for name in on])
+        there = set(map(int, patch.corners[inside].ravel()))
+        sides = {name: {pair for pair in pairs if there.issuperset(pair)} for name, pairs in sides.items()}
     return without_potential(
         moving(sides, conditions), conditions, lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])])
     )

@@ -7,6 +7,7 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
@@ -171,6 +172,8 @@ def outline(shell: Surface | ShellSection) -> Outline:
     if isinstance(shell, MeshSurface):
         scale, given = (shell.unit or 1.0) / shell.reference, shell.files.given.get(shell.path)
         file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, given)
+        if isinstance(given, Assembly):  # each member has its own mirrors, and all together none that is looked for
+            return Outline(lambda mirror, size: file, given.patch.embedding, normals, lambda x: x, None)
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:

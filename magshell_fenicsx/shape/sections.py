@@ -13,6 +13,7 @@ from magshell_fenicsx.input.section import (
     Section,
     in_units,
 )
+from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
 from magshell_fenicsx.shape.revolved import (
     AnnulusSurface,
@@ -64,6 +65,12 @@ class MeshSurface(FileKeys, SurfaceSection):
     @property
     def reference(self) -> float:
         return self.radius
+
+    @property
+    def assembly(self) -> Assembly | None:
+        """The several shells for which it stands."""
+        known = self.files.given.get(self.path)
+        return known if isinstance(known, Assembly) else None
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface

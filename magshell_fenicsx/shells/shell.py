@@ -39,11 +39,12 @@ from magshell_fenicsx.parts.forces.dead_load import (
     point_entries,
     vertex_normal,
 )
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import openings
+from magshell_fenicsx.parts.pressure.openings import beside, on_cells, openings
 from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
 from magshell_fenicsx.parts.supports.supports import (
     closing_point,
@@ -153,10 +154,12 @@ class ShellModel(Thin):
             grown = loads.natural.on(midsurface.patches, count, lambda given: carried(given, midsurface, in_cells))
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
-        folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
+        folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD
         carrier = on_surface(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell)
+        creases = Creases.of(loads.joints, midsurface) if loads.joints else None
+        pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, creases=creases)
         interior = factory.term(factory.interior_edges())
         terms: list[Term] = [factory.term(factory.membrane()), factory.term(factory.bending()), interior]
         held: list[Constraint] = []
@@ -212,7 +215,8 @@ class ShellModel(Thin):
         self.supports |= on_planes
         self.planes = tuple(planes)
         closing = closing_point(planes)
-        free_edges, self.without_potential = openings(self.r0, midsurface.edges, conditions)
+        open_at = beside(midsurface.edges, pressed) if pressed else midsurface.edges
+        free_edges, self.without_potential = openings(self.r0, open_at, conditions)
         closed = enclosed(loads, free_edges, self.without_potential)
         swept = loads.pressure or closed
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3) if closing is None else closing)

@@ -40,6 +40,8 @@ from magshell_fenicsx.parts.bodies.contact import (
     thinned_energy,
 )
 from magshell_fenicsx.parts.gap import thinning
+from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
@@ -69,6 +71,10 @@ class EnergyFactory:
         The applied fields known by values that were made.
     held
         The edges that hold the normal, and those on mirror planes, whose energies were made.
+    pressed
+        Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for 1.
+    creases
+        Joints with springs or hinges.
     """
 
     carrier: Carrier
@@ -82,6 +88,8 @@ class EnergyFactory:
     folded: bool = False
     fields: list[AppliedField] = field(default_factory=list)
     held: list[HeldEdge] = field(default_factory=list)
+    pressed: fem.Function | None = None
+    creases: Creases | None = None
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
@@ -120,6 +128,9 @@ class EnergyFactory:
     def interior_edges(self) -> Energy:
         of = edges.folded if self.folded else edges.interior
         density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
+        if self.creases:
+            zero = self._constant(0.0)
+            density = self.creases.added(density, self.free.setdefault(FOLD, zero) if self.creases.grow else zero)
         return self.carrier.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
@@ -245,13 +256,18 @@ class EnergyFactory:
     def pressure(self, *, potential: bool) -> Energy:
         """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        work = None if potential else densities.following
-        density = Density(densities.swept, (unit,), parts=MOVED, work=work)
+        of, following = (self._on_pressed(f) for f in (densities.swept, densities.following))
+        parameters = (unit,) if self.pressed is None else (unit, self.pressed)
+        density = Density(of, parameters, parts=MOVED, work=None if potential else following)
         return self.carrier.energy("pressure", density, "pressure", drawn=True)
 
+    def _on_pressed(self, of: Callable[..., Expr]) -> Callable[..., Expr]:
+        """A density of a pressure where that acts, whose last parameter is then `pressed`."""
+        return of if self.pressed is None else lambda *given: given[-1][0] * of(*given[:-1])
+
     def swept_volume(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part when its points move straight to their places."""
-        return self._volume(densities.swept)
+        """Delta V/R^3 of the modelled part when its points move straight to their places, where it is pressed."""
+        return self._volume(self._on_pressed(densities.swept), *([] if self.pressed is None else [self.pressed]))
 
     def volume_change(self, origin: Array) -> ufl.Form:
         """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""

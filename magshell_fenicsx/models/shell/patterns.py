@@ -12,6 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import Together, together
+from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.given import stored
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
@@ -96,6 +97,35 @@ class ByPatch:
         return np.broadcast_to(there, (*r0.shape[:-1], there.shape[-1]))
 
 
+@dataclass(frozen=True)
+class Placed:
+    """The pattern of one shell of several in its own frame, times a factor."""
+
+    pattern: Pattern
+    place: Place
+    factor: float = 1.0
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        own = self.pattern(self.place.own(r0), n0 @ self.place.Q)
+        return np.asarray(self.factor * own @ self.place.Q.T)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternsByPatch:
+    """A pattern on each of some cells of this rank, ghosts included; vectors elsewhere."""
+
+    patterns: tuple[tuple[NDArray[np.bool_], Pattern], ...]
+    others: ByPatch
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        found = np.array(self.others(r0, n0))
+        for inside, pattern in self.patterns:
+            of = inside[: len(r0)]  # owned cells come first
+            if of.any():
+                found[of] = pattern(r0[of], n0[of])
+        return found
+
+
 @dataclass(frozen=True, eq=False)
 class Carried:
     """What is given in each cell as a polynomial of its own; the places are the same in all cells.
@@ -154,12 +184,14 @@ def carried(given: GivenField, midsurface: Midsurface, cells: Cells) -> Carried:
 
 
 def by_patch(
-    vectors: Mapping[str, Array],
+    vectors: Mapping[str, Array | Pattern],
     patches: Mapping[str, NDArray[np.bool_]],
     cells: int,
     key: str = "magnetic.remanent.patches",
-) -> ByPatch:
+) -> ByPatch | PatternsByPatch:
     """A vector for each named patch of a mesh, and one for the "rest"; zero without. All have the same size.
+
+    A patch may have a pattern of vectors (3,) in place of one; patches that come later take the place of others.
 
     Parameters
     ----------
@@ -175,15 +207,21 @@ def by_patch(
     MeshError
         If there is no such patch.
     """
-    zero = np.zeros_like(next(iter(vectors.values())))
-    found = np.tile(vectors.get("rest", zero), (cells, 1))
-    for name, vector in vectors.items():
+    given = {name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()}
+    zero = np.zeros_like(next(iter(given.values())))
+    found = np.tile(given.get("rest", zero), (cells, 1))
+    patterns = list[tuple[NDArray[np.bool_], Pattern]]()
+    for name, vector in given.items():
         if name in patches:
             found[patches[name]] = vector
+            patterns = [(inside & ~patches[name], pattern) for inside, pattern in patterns]
+            pattern = vectors[name]
+            if callable(pattern):
+                patterns.append((patches[name], pattern))
         elif name != "rest":
             there = ", ".join(patches) or "none"
             raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
-    return ByPatch(found)
+    return PatternsByPatch(tuple(patterns), ByPatch(found)) if patterns else ByPatch(found)
 
 
 def pattern_field(

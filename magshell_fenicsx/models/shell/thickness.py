@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Together
+from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
@@ -21,14 +22,14 @@ LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h: a function of x, y, z over R, or a number for each named patch of a mesh (1 in the rest).
+    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a function (1 in the rest).
 
     `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in place of it, which is
     `carried` in the cells of a model.
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
-    patches: Mapping[str, float] | None = None
+    patches: "Mapping[str, float | PlacedFactor] | None" = None
     formulas: Together | None = None
     given: GivenField | None = None
     carried: Carried | None = None
@@ -54,6 +55,20 @@ class Thickness:
             formulas=self.formulas,
         )
         return fit.nodal[..., 0]
+
+
+@dataclass(frozen=True)
+class PlacedFactor:
+    """The thickness of a shell that has a place, times a number."""
+
+    own: Thickness
+    place: Place
+    times: float
+
+    def in_cells(self, cells: Cells) -> Array:
+        """Its values (cells, nodes) in cells in space; collective."""
+        there = replace(cells, nodal=self.place.own(cells.nodal))
+        return self.times * self.own.shown(there, self.own.at(there.nodal))
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
@@ -92,8 +107,14 @@ def thickness_field(
         refuse_unfit(between[..., 0], there, V.mesh.comm)
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
-        values[patch_of(patches or {}, name, "shell.thickness_factor")] = factor
+        inside = patch_of(patches or {}, name, "shell.thickness_factor")
+        values[inside] = factor.in_cells(some(cells_of(r0), inside)) if isinstance(factor, PlacedFactor) else factor
     return nodal_thickness(values, nodes, V)
+
+
+def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
+    """Some of this rank's cells."""
+    return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
 
 
 def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Function:

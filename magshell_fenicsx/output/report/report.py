@@ -29,7 +29,7 @@ from magshell_fenicsx.output.report.verdict import (
     verdict,
 )
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import headline, pole_of
+from magshell_fenicsx.output.store.known import headline, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
 from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -241,9 +241,9 @@ def _how_to_estimate(case: dict[str, Any]) -> str:
     """How to get an error estimate, for a run that has none."""
     if "tolerance" in case["mesh"]:
         return "mesh.tolerance was ignored because this run has no scalar result; the default mesh was used"
-    if case["model"] == "shell" and case["shell"]["geometry"] in ADAPTED:
+    if case["model"] == "shell" and shell_of(case)["geometry"] in ADAPTED:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
-    finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement twice as large"
+    finer = "mesh.degree one higher" if shell_of(case)["geometry"] == "mesh" else "mesh.refinement twice as large"
     return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.known import pole_of, read_summary
+from magshell_fenicsx.output.store.known import pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, quantity, shown
@@ -308,7 +308,7 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
         return Markup("")
     known = summary["dimensions"]
     in_metres = bool(known["radius"]) and known["units"] == "SI"
-    key, numbers = next(iter(place_in_units(place, summary["case"]["shell"]["geometry"], in_metres=in_metres).items()))
+    key, numbers = next(iter(place_in_units(place, shell_of(summary["case"])["geometry"], in_metres=in_metres).items()))
     if key == "degrees":
         found = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
     else:

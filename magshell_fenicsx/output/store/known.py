@@ -24,7 +24,7 @@ SECTIONS = {"remanent?": dict, "applied?": dict}
 SHAPE: dict[str, Any] = {
     "case": {
         "model": str,
-        "shell": {"geometry": str},
+        "shell?": {"geometry": str},
         **dict.fromkeys(("mesh", "output?"), dict),
         "magnetic?": SECTIONS,
         "loading?": (dict, list),
@@ -125,6 +125,11 @@ def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
     return next(located, path[-1]) if asked else path[-1]
 
 
+def shell_of(case: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The section of the shell in a case; several are one of geometry: mesh."""
+    return case.get("shell") or ({"geometry": "mesh"} if case.get("shells") else {})
+
+
 def pole_of(case: Mapping[str, Any]) -> str:
     """What the point of `w_pole_over_h` is called on a shape, where the case names no point.
 
@@ -133,7 +138,7 @@ def pole_of(case: Mapping[str, Any]) -> str:
     >>> [pole_of({"shell": {"geometry": name}}) for name in ("hemisphere", "strip", "torus")]
     ['the pole', 'the tip', 'the watched point']
     """
-    shell = case.get("shell") or {"geometry": "hemisphere"}
+    shell = shell_of(case) or {"geometry": "hemisphere"}
     geometry = shell.get("geometry")
     if geometry == "cap" and shell.get("hole") is None:
         return POLE

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
 from magshell_fenicsx.input.messages import shown
 from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrOfProgram, Section
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
@@ -67,6 +68,8 @@ class RemanentSection(FileKeys, Direction):
     filter: float | None = Field(default=None, gt=0, le=10)
     """Of kind: points: distance over which the points are averaged [R]"""
 
+    _of_shell: tuple[Place, float] | None = PrivateAttr(default=None)
+
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
         belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
@@ -81,6 +84,17 @@ class RemanentSection(FileKeys, Direction):
         if self.layers and abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
             raise ValueError("the fractions of the layers must add up to 1")
         return self
+
+    def placed(self, place: Place, factor: float) -> "RemanentSection":
+        """That of one shell of several, in the frame of which it is, times a factor."""
+        copied = self.model_copy()
+        copied._of_shell = place, factor
+        return copied
+
+    @property
+    def of_shell(self) -> tuple[Place, float] | None:
+        """The place of its shell and its factor; None where the frame is that of the case."""
+        return self._of_shell
 
     def directions(self) -> list[Direction]:
         """All directions that a mirror plane must hold; radial and tangential patterns allow every plane."""

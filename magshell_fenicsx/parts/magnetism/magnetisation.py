@@ -17,6 +17,7 @@ from magshell_fenicsx.models.shell.patterns import (
     Controls,
     Inside,
     Pattern,
+    Placed,
     WithinRims,
     radial,
     tangential,
@@ -76,7 +77,7 @@ def magnetisation(
     applied, *across = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(context.shell, MeshSurface):
-        patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
+        patches = {name: _on_patch(direction, context, turn) for name, direction in section.patches.items()}
     remanent = _remanence(section, context, turn, within) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
@@ -99,6 +100,15 @@ def magnetisation(
         own if np.isfinite(own) else 1.0,
         context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
     )
+
+
+def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:
+    """The remanence on a patch, which may be one shell of several."""
+    if not isinstance(section, RemanentSection) or section.of_shell is None:
+        return section.vector(turn)
+    place, factor = section.of_shell
+    own = _remanence(section, context, 0.0, {})
+    return factor * own @ place.Q.T if isinstance(own, np.ndarray) else Placed(own, place, factor)
 
 
 def _remanence(

@@ -44,7 +44,7 @@ class Magnetisation:
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
-        Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
+        Vectors (3,) or patterns on named patches of a mesh, in place of `remanent`; None without.
     layers
         Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
     law
@@ -62,7 +62,7 @@ class Magnetisation:
     energy: MagneticEnergy = "full"
     gradient: NDArray[np.float64] | None = None
     across: tuple[NDArray[np.float64], ...] = ()
-    patches: Mapping[str, NDArray[np.float64]] | None = None
+    patches: Mapping[str, NDArray[np.float64] | Pattern] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
     law: RemanenceLaw = "deformation"
     in_space: FieldInSpace | None = None

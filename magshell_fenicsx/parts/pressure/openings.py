@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import STRAIGHT
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
@@ -85,6 +86,34 @@ def openings(
     here = comm.allgather(moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions))
     names = [name for name in edges if any(name in rank for rank in here)]
     return names, without_potential(names, conditions, places)
+
+
+def on_cells(sides: Mapping[str, float], midsurface: Midsurface) -> fem.Function:
+    """Of each cell, (1,): the side on which a pressure acts there, 0 on others.
+
+    Parameters
+    ----------
+    sides
+        Patch -> 1 from outside, -1 from inside.
+    """
+    Q = fem.functionspace(midsurface.mesh, ("DG", 0, (1,)))
+    found = fem.Function(Q, name="pressed")
+    for name, side in sides.items():
+        found.x.array[Q.dofmap.list[midsurface.patches[name]].ravel()] = side
+    return found
+
+
+def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dict[str, NDArray[np.int32]]:
+    """The parts of edges, facets on this rank, whose cells are pressed."""
+    Q = pressed.function_space
+    topology = Q.mesh.topology
+    topology.create_connectivity(1, 2)
+    links = topology.connectivity(1, 2)
+
+    def acts(facet: int) -> bool:
+        return bool(pressed.x.array[Q.dofmap.list[links.links(facet)[0]]].any())
+
+    return {name: facets[np.array([acts(f) for f in facets], dtype=bool)] for name, facets in edges.items()}
 
 
 def ring_openings(ends: Mapping[str, Array], conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:

@@ -10,18 +10,19 @@ from pydantic import Field
 from magshell_fenicsx.input.section import over
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.course import Course, Fit, GasSection, Here, Now, Target, Until
-from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.step import PathStep, Step
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolved import CapSurface
-from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
 
 BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
     from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
 
 
@@ -44,6 +45,24 @@ class PressureSection(PathStep):
     """Target p; with control: load or arc [p_c]"""
     volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target ΔV; with control: volume or arc [R³]"""
+    on: dict[str, Literal["outside", "inside"]] | None = Field(default=None, min_length=1)
+    """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by default all from
+    outside. ΔV is then the volume that these sweep"""
+
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if self.on is None:
+            return
+        if context.solid or not isinstance(context.shell, MeshSurface):
+            raise ValueError(f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it out")
+        loads = [other.load for other in context.steps]
+        if any(isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads):
+            raise ValueError(f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells")
+        if any(load.kind == "edge" for load in loads):  # type: ignore[attr-defined]
+            raise ValueError(f"{step.key}.on: beside edges that move it is not built: leave out on, or the motion")
+
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        sides = {"outside": 1.0, "inside": -1.0}
+        return {"pressed": {name: sides[face] for name, face in (self.on or {}).items()}}
 
     def course(self, here: Here) -> Course:
         course = super().course(here)
@@ -79,6 +98,12 @@ def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
 class PressureSeen(Seen):
     """What is conjugate to a live pressure is the change of volume, which every run has."""
 
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        from magshell_fenicsx.models.shell.thickness import patch_of  # the solver takes long to import
+
+        for name in loads.pressed:
+            patch_of(surface.patches, name, "loading.on")
+
     def conjugate_unit(self, sight: Sight, name: str) -> float | None:
         """Of ΔV/R³."""
         if name != PressureSection.amplitude:
@@ -96,7 +121,8 @@ def account(context: Context, loads: "Loads") -> Account:
     """Whether there is a live pressure."""
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
-    return Account(["live pressure on the outer face" if context.solid else "live pressure"])
+    on = ", ".join(f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed.items())
+    return Account(["live pressure on the outer face" if context.solid else f"live pressure{on and f' on {on}'}"])
 
 
 @dataclass(frozen=True)

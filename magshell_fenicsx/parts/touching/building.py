@@ -75,9 +75,10 @@ def touchings(
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         own = 3 * index.local_range[0], 3 * index.size_local
-        touching = Touching(pair, cells, points, allowed, h, placed, lambda: whole(u), own, comm)
+        own_h = pair.thickness * h
+        touching = Touching(pair, cells, points, allowed, own_h, placed, lambda: whole(u), own, comm)
         deep, place = touching.deepest()
-        if deep > WITHIN * h:
+        if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)
             raise MeshError(
                 f"contact: {pair.words} overlap undeformed, by {deep / h:.4g} h at ({where}) R: move them apart"

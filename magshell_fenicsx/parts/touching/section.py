@@ -1,10 +1,11 @@
 """The key `contact`: which shells may touch, and what a case with it can be."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, nothing
@@ -36,16 +37,45 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        return {"pairs": pairs(self.given, context.shell.poisson_ratio)}
+        several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
+        return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.thicknesses if several else {})}
 
 
-def pairs(given: Sequence[Sequence[str]], nu: float) -> "tuple[Pair, ...]":
-    """What a case's pairs are in a model."""
+def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, float | None]) -> "tuple[Pair, ...]":
+    """What a case's pairs are in a model.
+
+    Parameters
+    ----------
+    thickness
+        Of several shells: name -> thickness over h, None where it varies.
+
+    Raises
+    ------
+    CaseError
+        If the faces of a pair are not one distance from their mid-surfaces.
+    """
     from magshell_fenicsx.parts.touching.touching import Pair  # the solver takes long to import
 
     k = STIFF / (12 * (1 - nu**2))
     several = len(given) > 1
-    return tuple(Pair((one, other), f"_{one}_{other}" if several else "", k) for one, other in given)
+    return tuple(
+        Pair((one, other), f"_{one}_{other}" if several else "", k, thickness=_mean(i, (one, other), thickness))
+        for i, (one, other) in enumerate(given)
+    )
+
+
+def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
+    """The mean of both thicknesses over h; a patch has that of its shell."""
+    found = list[float]()
+    for name in pair if thickness else ():
+        of = [t for shell, t in thickness.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
+        if None in of or len({*of}) > 1:
+            raise CaseError(
+                f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "
+                "shells of different thickness one by one"
+            )
+        found += [t for t in of[:1] if t is not None]
+    return sum(found) / len(found) if found else 1.0
 
 
 def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:
@@ -56,12 +86,14 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     ValueError
         With the key and what is allowed.
     """
-    seen = set[frozenset[str]]()
+    seen, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
     for i, pair in enumerate(given):
         if frozenset(pair) in seen:
             raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
         seen.add(frozenset(pair))
         for name in pair:
+            if shells and name not in (WHOLE, *shells) and not name.startswith(tuple(f"{each}_" for each in shells)):
+                raise ValueError(f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}")
             if name != WHOLE and not isinstance(context.shell, MeshSurface):
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
     if len(seen) > 1 and frozenset({WHOLE}) in seen:

@@ -61,12 +61,15 @@ class Pair:
         k of the penalty, over E h/R^2.
     bound
         Largest penetration that is allowed, over h.
+    thickness
+        The mean of both thicknesses over h.
     """
 
     names: tuple[str, str]
     suffix: str
     stiffness: float
     bound: float = 1e-3
+    thickness: float = 1.0
 
     @property
     def setting(self) -> str:

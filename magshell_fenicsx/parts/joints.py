@@ -1,0 +1,251 @@
+"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a rotational spring, as creases are.
+
+The vertices of both edges are glued, so that displacements agree. What is left is the energy of the edge between two
+cells, which C0 interior penalty has on every one: of a rigid joint it is that, of a hinge there is none, and of a
+spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle theta between the normals.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import radians
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
+from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
+from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.quantities.quantity import Quantity
+
+if TYPE_CHECKING:
+    from dolfinx import fem
+
+    from magshell_fenicsx.mesh.midsurface import Midsurface
+    from magshell_fenicsx.models.shell.energy import Density
+    from magshell_fenicsx.parts.loads import Loads
+
+AMPLITUDE = "fold"
+
+
+class JointSection(Section):
+    """Two edges that meet, joined."""
+
+    edges: Annotated[list[str], Field(min_length=2, max_length=2)]
+    """Both, each with the name of its shell: [upper.rim, lower.rim]"""
+    kind: Literal["rigid", "hinge", "spring"] = "rigid"
+    """The angle between the shells stays, is free, or has a spring"""
+    stiffness: Annotated[float, or_number("newton"), Field(ge=0, le=1e30)] | None = None
+    """Of kind: spring: moment per length and radian [force]"""
+    angle: float | None = Field(default=None, ge=-179, le=179)
+    """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded towards their
+    normals. By default that of the shells where they are; else it grows from there before the load, or as a step of
+    kind: fold [degree]"""
+
+    @model_validator(mode="after")
+    def _of_a_spring(self) -> Self:
+        if (self.stiffness is not None) != (self.kind == "spring"):
+            raise ValueError(f"stiffness belongs to kind: spring, and must be given there; the kind is {self.kind}")
+        if self.angle is not None and self.kind != "spring":
+            raise ValueError(f"angle: belongs to kind: spring; the kind is {self.kind}")
+        return self
+
+
+Joints = Annotated[list[JointSection], Field(max_length=100)]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint in a model.
+
+    Attributes
+    ----------
+    rigid
+        Whether the edge is as one within a shell; else it is a spring.
+    stiffness
+        Moment per length and radian over E h R; 0 of a hinge.
+    angle
+        At which the spring rests (rad); None for that of the placement.
+    """
+
+    edges: tuple[str, str]
+    rigid: bool
+    stiffness: float = 0.0
+    angle: float | None = None
+
+
+class Joined(KeyAbility[Sequence[JointSection]]):
+    """All joints of a case."""
+
+    key = "joints"
+
+    def refuse_unfit(self, context: Context) -> None:
+        """See that the edges are of several shells, each joined once, and that all else goes with joints."""
+        if not context.sections.get("shells"):
+            raise ValueError("joints: join edges of several shells: give shells")
+        context.needs("joints", "a mid-surface")
+        if context.shell.viscosity is not None or context.shell.relaxation:
+            raise ValueError("joints: with viscosity or relaxation they are not built: leave these out")
+        taken = set[str]()
+        for i, section in enumerate(self.given):
+            if section.stiffness:
+                context.has_modulus(f"joints.{i}.stiffness")
+            for name in section.edges:
+                if name in taken:
+                    raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")
+                taken.add(name)
+
+    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        scales = context.scales if any(section.stiffness for section in self.given) else None
+        joints = tuple(
+            Joint(
+                (section.edges[0], section.edges[1]),
+                section.kind == "rigid",
+                (section.stiffness or 0.0) / (scales.E * scales.h * scales.R) if scales else 0.0,
+                None if section.angle is None else radians(section.angle),
+            )
+            for section in self.given
+        )
+        return {"joints": joints}
+
+
+def account(context: Context, loads: "Loads") -> Account:
+    """Which edges are joined."""
+    return Account([_words(joint) for joint in loads.joints])
+
+
+def _words(joint: Joint) -> str:
+    kind = "rigidly" if joint.rigid else "by a hinge"
+    if joint.stiffness:
+        kind = f"by a spring, stiffness over E h R {joint.stiffness:.4g}"
+    return f"{' and '.join(joint.edges)} joined {kind}"
+
+
+class FoldStep(PathStep):
+    """The angles at which springs of joints rest grow from those of the shells where they are (0) to their own (1)."""
+
+    amplitude: ClassVar[str] = AMPLITUDE
+    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity(AMPLITUDE, "fold", "How far the rest angles of joints have grown to those of the case.", "load"),
+    )
+    kind: Literal["fold"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    factor: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of the factor, 1 by default"""
+
+    @property
+    def _end(self) -> float | None:
+        return 1.0
+
+    @classmethod
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        driven = loading is not None and loading.amplitude == cls.amplitude
+        return [] if driven or not rests_elsewhere(context) else [("joints", FoldBefore(kind="fold"))]
+
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if not rests_elsewhere(context):
+            raise ValueError(f"{step.key}.kind: fold: needs a joint with an angle")
+
+
+class FoldBefore(FoldStep):
+    """The growth before the one load of a case; it ends at the first instability."""
+
+    def drive(self, now: Now) -> Drive:
+        return Drive("arc", "load", 1.0, [1.0], 0.5, 1.0)
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            return (
+                f"the springs of joints alone make the shells unstable at {mu[AMPLITUDE]:.9g} of their angles "
+                f"({what}): to go on, take these as a load, kind: fold"
+            )
+
+        return replace(course, until="limit", forbidden=forbidden)
+
+
+def rests_elsewhere(context: Context) -> bool:
+    """Whether a spring has an angle of its own."""
+    return any(section.angle is not None for section in context.sections.get("joints") or ())
+
+
+class FoldSeen(Seen):
+    """How far the angles have grown."""
+
+    def named(self, loads: "Loads") -> Sequence[str]:
+        return (AMPLITUDE,) if any(joint.angle is not None for joint in loads.joints) else ()
+
+
+@dataclass(frozen=True)
+class Creases:
+    """The edges between cells at which springs and hinges are.
+
+    Attributes
+    ----------
+    marks
+        (n,) in each cell: of each joint 1 beside its one edge, -1 beside the other, 0 elsewhere.
+    stiffness, angle, given
+        (n,) of each: the angle at which it rests where the last is 1, else 0 and the placement's.
+    """
+
+    marks: "fem.Function"
+    stiffness: "fem.Constant"
+    angle: "fem.Constant"
+    given: "fem.Constant"
+
+    @classmethod
+    def of(cls, joints: Sequence[Joint], midsurface: "Midsurface") -> "Creases | None":
+        """Those of some joints; None if all are rigid."""
+        import numpy as np
+        from dolfinx import fem
+
+        some = [(joint, of) for joint, of in zip(joints, midsurface.joints, strict=True) if not joint.rigid]
+        if not some:
+            return None
+        Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))
+        marks = fem.Function(Q, name="joints")
+        marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack([of for _, of in some])
+        numbers = [(j.stiffness, j.angle or 0.0, float(j.angle is not None)) for j, _ in some]
+        return cls(marks, *(fem.Constant(midsurface.mesh, np.array(each)) for each in zip(*numbers, strict=True)))
+
+    @property
+    def grow(self) -> bool:
+        """Whether an angle grows."""
+        return bool(self.given.value.any())
+
+    def added(self, density: "Density", factor: "fem.Constant") -> "Density":
+        """The density of edges between cells, with springs in its place at joints, whose angles have grown so far."""
+        import ufl
+
+        from magshell_fenicsx.models.shell import kinematics as kin
+        from magshell_fenicsx.models.shell.edges import fold_angle
+
+        count, grow = self.marks.ufl_shape[0], self.grow
+
+        def of(*arguments: Any, **known: Any) -> Any:
+            *given, (plus, minus), k, angle, has, grown = arguments
+            r0, u, m = given[:3]
+            within, springs, joined = density.of(*given, **known), 0, 0
+            stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
+            first = fold_angle(r0[0], r0[1], m[0])
+            sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+            for i in range(count):
+                product = plus[i] * minus[i]
+                here = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
+                s0, c0 = first
+                if grow:
+                    placed = ufl.atan2(first[0], first[1])
+                    rest = placed + grown * has[i] * (angle[i] - placed)
+                    s0, c0 = ufl.sin(rest), ufl.cos(rest)
+                turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
+                springs += here * k[i] / 2 * turned**2 * stretch
+                joined += here
+            return (1 - joined) * within + springs
+
+        more = (self.marks, self.stiffness, self.angle, self.given, factor)
+        return replace(density, of=of, parameters=(*density.parameters, *more))

@@ -1,0 +1,78 @@
+"""Joints of plates: a hinge and a rigid joint against beams, a crease with a spring against two bars."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.simulate.follow import follow
+
+h = 0.02
+D = h**3 / 12
+
+
+def plate(position: list[float], polar: float = 0.0, **keys: Any) -> dict[str, Any]:
+    shell = {"geometry": "plate", "length": 1, "width": 0.25, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
+    return {"shell": shell, "place": {"position": position, "axis": {"polar": polar}}, **keys}
+
+
+def deflected(joint: dict[str, Any], gap: float = 0.0) -> float:
+    """Of the joint of two plates under a weight of 1e-8 on the first; their triangles do not meet."""
+    left = plate([0, 0, 0], boundary={"left": "clamped"}, points={"tip": [1, 0.125, 0]})
+    right = plate([1 + gap, 0, 0], boundary={"right": {"held": ["y", "z"]}}, mesh={"size": 0.1})
+    loads = [{"over": "left", "per_area": [0, 0, -1e-8]}]
+    data = {
+        "shells": {"left": left, "right": right},
+        "joints": [{"edges": ["left.right", "right.left"], **joint}],
+        "mesh": {"degree": 3, "size": 0.25},
+        "loading": {"kind": "dead", "control": "load", "loads": loads, "factor": 1, "points": 1},
+    }
+    scene = Scene(Case.from_source(data))
+    *_, last = follow(scene)
+    return -scene.observe(last.point.state)["left_tip_uz"]
+
+
+def test_hinge() -> None:
+    """A cantilever, on which the other plate hangs: q L^4/(8 D), 1e-4."""
+    assert deflected({"kind": "hinge"}) == pytest.approx(1e-8 / (8 * D), rel=1e-4)
+
+
+def test_rigid_and_stiff() -> None:
+    """One beam of twice the length, clamped and supported, loaded on half of it: Macaulay, 1e-4."""
+    R = (1 / 8 + 1 / 6) / (8 / 3)  # of the support, over q L: the free end would sink by q L^4 (1/8 + 1/6)/D
+    at_joint = 1 / 8 - R * 5 / 6  # a force at the end lifts the middle by R L^3 (3 2 - 1)/(6 D)
+    rigid = deflected({"kind": "rigid"})
+    assert rigid == pytest.approx(1e-8 * at_joint / D, rel=1e-4)
+    assert deflected({"kind": "spring", "stiffness": 1e6 * D}) == pytest.approx(rigid, rel=1e-4)
+
+
+def test_angle_of_a_crease() -> None:
+    """A weak spring between stiff plates: with the ends held apart it rests where two bars have its angle: 1e-4."""
+    angle = 60.0
+    at = np.radians(angle / 2)
+    left = plate([0, 0, 0], -29.0, boundary={"left": {"held": ["x", "y", "z"]}})
+    x, z = np.cos(np.radians(29.0)), np.sin(np.radians(29.0))
+    right = plate([x, 0, z], 29.0, boundary={"right": {"held": ["y", "z"]}}, points={"end": [1, 0.125, 0]})
+    data = {
+        "shells": {"left": left, "right": right},
+        "joints": [{"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 0.01 * D, "angle": -angle}],
+        "mesh": {"degree": 3, "size": 0.5},
+        "loading": {"kind": "dead", "control": "load", "factor": 1, "points": 1,
+                    "loads": [{"edge": "right.right", "force": [-1e-12, 0, 0]}]},
+    }  # fmt: skip
+    scene = Scene(Case.from_source(data))
+    *_, last = follow(scene)
+    along = 2 * x + scene.observe(last.point.state)["right_end_ux"]
+    assert along == pytest.approx(2 * np.cos(at), rel=1e-4)
+
+
+def test_messages() -> None:
+    with pytest.raises(MeshError, match=r"joints.0.edges: left_right and right_left do not meet, by 0.1 R at \(1.1, "):
+        deflected({"kind": "hinge"}, gap=0.1)
+    with pytest.raises(
+        CaseError, match=r"stiffness belongs to kind: spring, and must be given there; the kind is hinge"
+    ):
+        deflected({"kind": "hinge", "stiffness": 1})

@@ -1,0 +1,105 @@
+"""Several shells in one case: each is as it is alone, they touch, and they are magnetised in their own frames."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.simulate.follow import follow
+
+h = 0.02
+
+
+def cap(**shell: Any) -> dict[str, Any]:
+    """One of several shells; keys with a value of None are left out."""
+    keys = {"geometry": "cap", "radius": 1, "polar": 40, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    return {"shell": keys | shell, "boundary": {"rim": "clamped"}, "points": {"tip": [0, 0, 1]}}
+
+
+def end(data: dict[str, Any]) -> tuple[Scene, dict[str, float]]:
+    """The scene of a case, and what is observed at its end."""
+    scene = Scene(Case.from_source(data))
+    *_, last = follow(scene)
+    return scene, scene.observe(last.point.state)
+
+
+def test_far_apart() -> None:
+    """Each is as it is alone, on the same mesh, whatever its place, thickness and side: 1e-10."""
+    flaw = {"kind": "gaussian", "amplitude": 0.3, "width": 0.2}
+    lower, upper = cap(imperfections=[flaw]), cap(thickness_factor="1 + x**2")
+    mesh = {"degree": 3, "size": 0.3}
+    place = {"position": [7, 1, 5], "axis": {"polar": 180, "azimuth": 25}}
+    load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-5, "points": 1}
+    both = {"shells": {"lower": lower, "upper": upper | {"place": place}}, "mesh": mesh}
+    _, seen = end(both | {"loading": load | {"on": {"upper": "outside"}}})
+    _, alone = end(upper | {"mesh": mesh, "symmetry": "none", "loading": load})
+    assert seen["upper_tip_uz"] == pytest.approx(-alone["tip_uz"], rel=1e-10)
+    assert seen["volume_change"] == pytest.approx(alone["volume_change"], rel=1e-10)
+    assert abs(seen["lower_tip_uz"]) < 1e-16
+    _, seen = end(both | {"loading": load | {"on": {"lower": "inside"}, "pressure": -1e-5}})
+    _, alone = end(lower | {"mesh": mesh, "symmetry": "none", "loading": load})
+    assert seen["lower_tip_uz"] == pytest.approx(alone["tip_uz"], rel=1e-10)
+
+
+def test_sizes() -> None:
+    """One with another radius and thickness is as it is alone; numbers are over R and h of the first: 1e-5."""
+    upper = cap(radius=1.5, thickness=0.01) | {"points": {"tip": [0, 0, 1.5]}}
+    load = {"kind": "indentation", "control": "load", "points": 1}
+    data = {"shells": {"lower": cap(), "upper": upper | {"place": {"position": [0, 0, 9]}}}, "mesh": {"degree": 3}}
+    scene, seen = end(data | {"loading": load | {"at": {"point": "upper.tip"}, "force": 0.05}})
+    assert scene.problem.thickness.patches == {"lower": 1.0, "upper": 0.5}
+    force = 0.05 * (0.02**3 / 1) / (0.01**3 / 1.5)  # 2 pi D/R of both
+    alone = upper | {"mesh": {"degree": 3}, "symmetry": "none"}
+    _, other = end(alone | {"loading": load | {"at": {"point": "tip"}, "force": force}})
+    assert seen["upper_tip_uz"] == pytest.approx(other["tip_uz"], rel=1e-5)
+
+
+def test_remanence_of_each() -> None:
+    """In its own frame, turned with it, and over that of the first one."""
+    remanents = {
+        "lower": {"flux_density": "50 mT", "kind": "radial"},
+        "upper": {"flux_density": "100 mT", "polar": 90},
+        "plain": None,
+    }
+    units = {"radius": "10 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
+    shells = {}
+    for i, (name, remanent) in enumerate(remanents.items()):
+        place = {"position": [0, 0, f"{50 * i} mm"], "axis": {"polar": 90 * i, "azimuth": 90}}
+        shells[name] = cap(**units) | {"points": {}, "place": place} | ({"remanent": remanent} if remanent else {})
+    data = {"shells": shells, "magnetic": {"applied": {"flux_density": "1 mT"}}, "mesh": {"degree": 2, "size": "5 mm"}}
+    scene = Scene(Case.from_source(data))
+    model, patches = scene.model, scene.model.midsurface.patches
+    Br = model.loads.magnetic.remanent(*model.places(model.V.element.basix_element.points))
+    _, n = model.places(model.V.element.basix_element.points)
+    assert Br[patches["lower"]] == pytest.approx(n[patches["lower"]], abs=1e-12)
+    # e1 turns by 90 degrees about e2 to -e3, which stays where it is about e3
+    assert Br[patches["upper"]] == pytest.approx(np.broadcast_to([0, 0, -2], Br[patches["upper"]].shape), abs=1e-12)
+    assert not Br[patches["plain"]].any()
+    again = scene.problem.again({"shells.upper.shell.thickness": 1e-4})
+    assert again.thickness.patches["upper"] == pytest.approx(0.5)
+
+
+def test_messages() -> None:
+    data = {"shells": {"lower": cap(), "upper": cap()}, "contact": [["upper", "lover"]]}
+    with pytest.raises(CaseError, match=r"contact.0: lover: there is no such shell, only lower, upper"):
+        Case.from_source(data)
+    with pytest.raises(CaseError, match=r"shells: each has its own boundary: leave out boundary, or shells"):
+        Case.from_source(data | {"boundary": {}})
+    with pytest.raises(CaseError, match=r"shells.upper.shell.thickness: 0: must be greater than 0"):
+        Case.from_source({"shells": {"lower": cap(), "upper": cap(thickness=0)}})
+    with pytest.raises(CaseError, match=r"shells.upper.shell.poisson_ratio: is another than that of lower"):
+        Case.from_source({"shells": {"lower": cap(), "upper": cap(poisson_ratio=0.5)}})
+    units = {"radius": "10 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
+    measured = {"shells": {"lower": cap(), "upper": cap(**units) | {"points": {}}}}
+    with pytest.raises(CaseError, match=r"shells.upper.shell: lengths of upper have units and those of lower none"):
+        Case.from_source(measured)
+    wrong = {"shells": {"lower": cap(), "upper": cap() | {"boundary": {"rimm": "clamped"}}}}
+    with pytest.raises(MeshError, match=r"shells.upper.*rimm"):
+        Case.from_source(wrong).problem()
+    near = cap() | {"place": {"position": [0, 0, 2 + 0.5 * h], "axis": {"polar": 180}}}
+    data = {"shells": {"lower": cap(), "upper": near}, "contact": [["upper", "lower"]], "mesh": {"degree": 2}}
+    with pytest.raises(MeshError, match=r"contact: upper and lower overlap undeformed, by 0\.[45]\d* h at \("):
+        Scene(Case.from_source(data))

@@ -1,0 +1,45 @@
+"""Runs of several shells that are joined: on several ranks, and interrupted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import all_started, magshell, read_path
+from conftest import CASES
+from interrupted import kill, start, wait_for_rows
+
+SHORT = ["--set=loading.displacement=0.02", "--set=loading.points=2", "--no-pictures"]
+EXACT = ("w_over_h", "left_crease_uz", "load_factor", "energy")
+
+
+def command(out: Path) -> list[str]:
+    return ["run", str(CASES / "crease.yaml"), *SHORT, "--out", str(out)]
+
+
+@pytest.mark.slow
+def test_ranks(tmp_path: Path) -> None:
+    """1, 2 and 3: every target to 1e-9 of the largest value."""
+    assert magshell(*command(tmp_path / "1")).returncode == 0
+    for ranks in (2, 3):
+        done = all_started([command(tmp_path / str(ranks))], ranks)
+        assert done.returncode == 0, done.stderr
+    one, *others = (read_path(tmp_path / str(ranks)) for ranks in (1, 2, 3))
+    for other in others:
+        assert [row["label"] for row in other] == [row["label"] for row in one]
+        for column in EXACT:
+            a, b = (np.array([float(row[column]) for row in rows if row["label"] == "target"]) for rows in (one, other))
+            assert a == pytest.approx(b, rel=0, abs=1e-9 * np.abs(a).max()), column
+
+
+@pytest.mark.slow
+def test_resume(tmp_path: Path) -> None:
+    """Killed on the way and resumed: the same rows to the last digit."""
+    assert magshell(*command(tmp_path / "whole")).returncode == 0
+    run = start(*command(tmp_path / "killed"))
+    wait_for_rows(run, tmp_path / "killed", 2)
+    kill(run, 0)
+    assert len(read_path(tmp_path / "killed")) < len(read_path(tmp_path / "whole"))
+    assert magshell(*command(tmp_path / "killed"), "--resume").returncode == 0
+    whole, again = (read_path(tmp_path / name) for name in ("whole", "killed"))
+    for column in ("label", *EXACT):
+        assert [row[column] for row in again] == [row[column] for row in whole]
