@@ -200,9 +200,10 @@ class MagneticSection(Ability):
     """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a number, a formula of
     the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
     flux densities, and always energy: full"""
-    interaction: Literal["none", "others"] = "none"
+    interaction: Literal["none", "others", "all"] = "none"
     """Whether parts of the shell that are not connected, those of a mesh file, act on each other with their own fields
-    (others), or feel the applied field alone (none). It needs remanent.flux_density and shell.youngs_modulus"""
+    (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs
+    remanent.flux_density and shell.youngs_modulus"""
     remanent: RemanentSection | None = RemanentSection.model_construct()
     """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""
     applied: AppliedSection = AppliedSection.model_construct()

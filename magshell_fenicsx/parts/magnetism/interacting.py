@@ -16,6 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
+from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.parts.seen import Sight
 
@@ -65,7 +66,7 @@ class Cells:
 
 
 class InteractionTerm:
-    """The energy over E h R² of the parts of a model in each other's field, with the amplitude `interaction`.
+    """The energy over E h R² of the parts of a model in each other's and their own field; its amplitude: `interaction`.
 
     Raises
     ------
@@ -77,20 +78,21 @@ class InteractionTerm:
 
     def __init__(self, model: "Observed", u: fem.Function, of: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE
+        self._itself = of.itself
         self._model, self._u = model, u
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
         self._cells = Cells.of(V)
         unknowns = 3 * V.dofmap.index_map.size_global
-        if self._cells.parts.max() == 0:
+        if not of.itself and self._cells.parts.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between parts of a mesh file that are not connected, and the shell "
-                "is one part: take interaction: none, or a mesh of several parts"
+                "is one part: take interaction: all, or a mesh of several parts"
             )
         if unknowns > LARGEST:
             raise CaseError(
-                f"magnetic.interaction: others: the model has {unknowns} unknowns; as all of them act on each other, "
+                f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on each other, "
                 f"at most {LARGEST} are allowed: take a coarser mesh or a lower mesh.degree"
             )
         self._given: tuple[Array, ...] = ()
@@ -128,6 +130,24 @@ class InteractionTerm:
             self._charged.evaluate(nodes, self._cells.own, add)
         except Touching:
             rows[:] = np.nan
+        if self._near:
+            self._add_near(nodes, rows, factor * self._scale)
+
+    def _add_near(self, nodes: Array, rows: Array, factor: float) -> None:
+        """What cells that touch add to the rows of nodes of own cells."""
+        assert self._near
+        own, flat = self._cells.own, rows.reshape(3 * len(rows), -1)
+        local = self._u.function_space.dofmap.list
+        for c, d, H in self._near.stiffness(nodes):
+            kept = (c >= own.start) & (c < own.stop)
+            shape = H[kept].shape
+            i = 3 * local[c[kept] - own.start][:, None, :, None, None] + np.arange(3)[:, None, None, None]
+            j = 3 * self._cells.nodes[d[kept]][:, None, None, None, :] + np.arange(3)[:, None]
+            at = tuple(np.broadcast_to(each, shape).ravel() for each in (i, j))
+            found = coo_array((H[kept].ravel(), at), flat.shape).tocsr()
+            for row in np.flatnonzero(np.diff(found.indptr)):
+                some = slice(found.indptr[row], found.indptr[row + 1])
+                flat[row, found.indices[some]] += factor * found.data[some]
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""
@@ -148,18 +168,30 @@ class InteractionTerm:
         given = r0, self._over_ranks(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list], cells=True)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._seen = given, None
-            self.__dict__.pop("_charged", None)
+            for name in ("_charged", "_near"):
+                self.__dict__.pop(name, None)
         return np.asarray((r0 + u)[self._cells.nodes])
 
     @cached_property
     def _charged(self) -> Charged:
+        shape, cells, edges = self._all()
+        return Charged(shape, self._cells.parts, cells, edges, self._comm, self._near)
+
+    @cached_property
+    def _near(self) -> Near | None:
+        shape, cells, edges = self._all()
+        if not self._itself:
+            return None
+        return Near(shape, self._cells.nodes[:, :3], cells, edges, self._cells.own, self._comm)
+
+    def _all(self) -> tuple[Shape, Ints, Ints]:
+        """The cells of all ranks, and their edges that may be charged; collective."""
         own = own_field(self._sight)
         shape, (cells, edges) = own._shape({}), own._edges
         thick = shape.thick and (shape.thick[0], self._over_ranks(shape.thick[1], cells=True))
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
         whole = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
-        at = self._over_ranks(np.asarray(cells) + self._cells.own.start), self._over_ranks(np.asarray(edges))
-        return Charged(whole, self._cells.parts, *at, self._comm)
+        return whole, self._over_ranks(np.asarray(cells) + self._cells.own.start), self._over_ranks(np.asarray(edges))
 
     @property
     def _sight(self) -> Sight:
