@@ -201,8 +201,8 @@ class MagneticSection(Ability):
     the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
     flux densities, and always energy: full"""
     saturation: FluxDensity | None = Field(default=None, gt=0, le=1e3)
-    """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in proportion to the field. It
-    needs a susceptibility and flux densities"""
+    """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in proportion to the field.
+    It needs a susceptibility and flux densities"""
     interaction: Literal["none", "others", "all"] = "none"
     """Whether parts of the shell that are not connected, those of a mesh file, act on each other with their own fields
     (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs

@@ -133,21 +133,15 @@ class InteractionTerm:
         if self._near:
             self._add_near(nodes, rows, factor * self._scale)
 
-    def _add_near(self, nodes: Array, rows: Array, factor: float) -> None:
+    def _add_near(self, nodes_of_cells: Array, rows: Array, factor: float) -> None:
         """What cells that touch add to the rows of nodes of own cells."""
         assert self._near
-        own, flat = self._cells.own, rows.reshape(3 * len(rows), -1)
-        local = self._u.function_space.dofmap.list
-        for c, d, H in self._near.stiffness(nodes):
-            kept = (c >= own.start) & (c < own.stop)
-            shape = H[kept].shape
-            i = 3 * local[c[kept] - own.start][:, None, :, None, None] + np.arange(3)[:, None, None, None]
-            j = 3 * self._cells.nodes[d[kept]][:, None, None, None, :] + np.arange(3)[:, None]
-            at = tuple(np.broadcast_to(each, shape).ravel() for each in (i, j))
-            found = coo_array((H[kept].ravel(), at), flat.shape).tocsr()
-            for row in np.flatnonzero(np.diff(found.indptr)):
-                some = slice(found.indptr[row], found.indptr[row + 1])
-                flat[row, found.indices[some]] += factor * found.data[some]
+        own, local, nodes = self._cells.own, self._u.function_space.dofmap.list, self._cells.nodes
+        for first, second, H in self._near.stiffness(nodes_of_cells):
+            for c, d, part in zip(first, second, H, strict=True):
+                if c in own:
+                    at = local[c - own.start][:, None], slice(None), nodes[d], slice(None)
+                    rows[at] += factor * part.transpose(1, 3, 0, 2)
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""

@@ -120,10 +120,10 @@ class Near:
         self._scale = float(shape.h / np.median(sides))
         self._heights = heights(Faces(shape, np.arange(1)))
         meeting: dict[int, list[int]] = {}
-        for cell, three in enumerate(corners):
+        for cell, three in enumerate(corners.tolist()):
             for each in three:
-                meeting.setdefault(int(each), []).append(cell)
-        self.touching = [sorted({other for each in three for other in meeting[int(each)]}) for three in corners]
+                meeting.setdefault(each, []).append(cell)
+        self.touching = [sorted({other for each in three for other in meeting[each]}) for three in corners.tolist()]
         self._free = self._at_boundary()
         kinds: dict[Kind, list[tuple[int, int]]] = {}
         for c, others in enumerate(self.touching):
@@ -135,7 +135,7 @@ class Near:
         self._batches = list(self._charged(kinds))
 
     def add(self, nodes: Array, gradient: Array) -> float:
-        """The energy of the pairs whose first cell is here; its gradient (cells, k, 3) is added, right for own cells."""
+        """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added, right for own cells."""
         return sum(self._evaluate(each, nodes, gradient, None) for each in self._batches)
 
     def stiffness(self, nodes: Array) -> Iterator[tuple[Ints, Ints, Array]]:
@@ -225,7 +225,9 @@ class Near:
         for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
             made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
-        most = max((float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left[3], each.right[3])), default=0)
+        most = max(
+            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left[3], each.right[3])), default=0
+        )
         for each in made:
             if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left[3], each.right[3])):
                 yield each
@@ -239,7 +241,11 @@ class Near:
         if not same:
             count = len(first.weights)
             T = T.reshape(count, -1, *T.shape[1:])
-            h, t, q = h.reshape(count, -1, h.shape[-1]), t.reshape(len(t), count, -1), q.reshape(len(q), count, -1, h.shape[-1])
+            h, t, q = (
+                h.reshape(count, -1, h.shape[-1]),
+                t.reshape(len(t), count, -1),
+                q.reshape(len(q), count, -1, h.shape[-1]),
+            )
         return Batch(
             pairs, 1.0 if kind[0] == "strip" else 0.5, own, (left[0], left[2], left[1], left[3]), (T, t, h, q), same
         )
@@ -278,7 +284,7 @@ class Near:
         return Points(np.concatenate(X), np.concatenate(w))
 
     def _found(self, cells: Ints, points: Points, edge: int | None) -> tuple[Array, Array, Array, Array]:
-        """Tables (n, 3, k), heights over the thickness (n, layers), thickness (cells, n) and charges (cells, n, layers)."""
+        """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
         shape, X = self._shape, points.X
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
         t = shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
@@ -306,7 +312,7 @@ class Near:
         """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
         (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
         at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
-        found = [np.zeros((len(self._corners), len(at))) for _ in range(3)]
+        found: list[Array] = [np.zeros((len(self._corners), len(at))) for _ in range(3)]
         for edge, into in enumerate(found):
             cells = np.flatnonzero(self._strips[:, edge])
             if len(cells):
@@ -324,5 +330,3 @@ def _lagrange(n: int, x: Array) -> Array:
 def _quadrature(degree: int) -> tuple[Array, Array]:
     X, w = basix.make_quadrature(basix.CellType.triangle, degree)
     return np.asarray(X), np.asarray(w)
-
-

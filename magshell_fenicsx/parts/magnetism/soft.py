@@ -5,12 +5,13 @@ mu0 M = chi (B_t + B_n n/(1 + chi)) and, per area, the energy -h M.B/2. Over E h
 (lambda_m is the size of the applied field in them), it is -chi/2 (s B)² with s = sqrt(mu0 E)/|Br|. A shell without
 remanence has sqrt(mu0 E) in place of |Br|. The field of other places of the shell is left out.
 
-With a saturation J the material follows Langevin's law, mu0 M = J L(3 chi b/J) along b = mu0 H, L(x) = coth x - 1/x, with
-the coenergy w = J²/(3 chi) ln (sinh x/x), x = 3 chi b/J. Along the sheet b is B; across it is the number for which
+With a saturation J the material follows Langevin's law, mu0 M = J L(3 chi b/J) along b = mu0 H, L(x) = coth x - 1/x,
+with the coenergy w = J²/(3 chi) ln (sinh x/x), x = 3 chi b/J. Along the sheet b is B; across it is the number for which
 
     e(B) = max over b_n of -w(|(B_t, b_n)|) - (B_n - b_n)²/2,
 
-that is B_n = b_n + mu0 M_n. Newton's method finds it from b_n = B_n/(1 + chi), from below and without turning back.
+that is B_n = b_n + mu0 M_n. Newton's method finds it from b_n = B_n/(1 + chi), from below, in steps (`STEPS`) that are
+part of the density.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 TERM = "soft magnetism"
-STEPS = 5  # of Newton's method for the field across a sheet that saturates
+STEPS = ((5.0, 3), (20.0, 4), (100.0, 5), (np.inf, 6))  # largest susceptibility, and Newton's steps for 1e-6
+TINY = 1e-30  # where there is no field
 SMALL = 0.04  # x² below which a series is exact to rounding
 
 
@@ -64,6 +66,12 @@ class Soft:
     patches: Mapping[str, Array] | None = None
     saturation: float | None = None
 
+    @property
+    def steps(self) -> int:
+        """Of Newton's method for the field across the sheet."""
+        chi = self.susceptibility
+        return STEPS[-1][1] if callable(chi) else next(steps for most, steps in STEPS if chi <= most)
+
     def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "Soft":
         """With a pattern in place of patches."""
         return replace(self, susceptibility=carried(self.patches), patches=None) if self.patches else self
@@ -80,9 +88,9 @@ class Soft:
         if self.saturation is None:
             return np.asarray(chi * (B - chi / (1 + chi) * across * n))
         along = B - across * n
-        b = _across(chi, across, np.sum(along * along, axis=-1, keepdims=True), self.saturation, _ratios)
+        b = _across(chi, across, np.sum(along * along, axis=-1, keepdims=True), self.saturation, self.steps, _ratio)
         y = (3 * chi / self.saturation) ** 2 * (np.sum(along * along, axis=-1, keepdims=True) + b**2)
-        return np.asarray(chi * _ratios(y)[1] * (along + b * n))
+        return np.asarray(chi * _ratio(y) * (along + b * n))
 
 
 @dataclass(frozen=True)
@@ -149,8 +157,8 @@ class Sheet:
         if largest is None:
             return chi * (B - chi / (1 + chi) * normal * n)
         along = B - normal * n
-        b = _across(chi, normal, ufl.dot(along, along), largest, _smooth)
-        return chi * _smooth((3 * chi / largest) ** 2 * (ufl.dot(along, along) + b**2))[1] * (along + b * n)
+        b = self._across(chi, normal, ufl.dot(along, along))
+        return chi * _ratio_of((3 * chi / largest) ** 2 * (ufl.dot(along, along) + b**2)) * (along + b * n)
 
     def of_field(self, chi: Expr, s: Expr, B: Expr, n: Expr) -> Expr:
         """The energy over E h, that of a linear material -s² mu0 M.B/2."""
@@ -158,9 +166,14 @@ class Sheet:
         if largest is None:
             return -(s**2) / 2 * ufl.dot(B, self.polarisation(chi, B, n))
         squared = ufl.dot(B, B) - normal**2
-        b = _across(chi, normal, squared, largest, _smooth)
+        b = self._across(chi, normal, squared)
         field = squared + b**2
-        return -(s**2) / 2 * (chi * field * _smooth((3 * chi / largest) ** 2 * field)[0] + (normal - b) ** 2)
+        return -(s**2) / 2 * (chi * field * _coenergy((3 * chi / largest) ** 2 * field) + (normal - b) ** 2)
+
+    def _across(self, chi: Expr, normal: Expr, along: Expr) -> Expr:
+        assert self.field.soft
+        assert self._saturation
+        return _across(chi, normal, along, self._saturation, self.field.soft.steps, _ratio_of)
 
     @property
     def _saturation(self) -> float | None:
@@ -172,44 +185,40 @@ def number(chi: Expr) -> Expr:
     return chi[0] if chi.ufl_shape else chi
 
 
-def _across(chi: Any, normal: Any, along: Any, largest: float, ratios: Callable[[Any], tuple[Any, Any, Any]]) -> Any:
-    """b_n, from B_n and |B_t|², see above."""
+def _across(chi: Any, normal: Any, along: Any, largest: float, steps: int, ratio: Callable[[Any], Any]) -> Any:
+    """b_n, from B_n and |B_t|², see above; `ratio` is 3 L(x)/x of x², whose slope is 3 (1 - k) - x² k²/3 over 2 x²."""
     scale, b = (3 * chi / largest) ** 2, normal / (1 + chi)
-    for _ in range(STEPS):
-        _, k, slope = ratios(scale * (along + b**2))
-        b = b + (normal - b - chi * b * k) / (1 + chi * (k + 2 * scale * b**2 * slope))
+    for _ in range(steps):
+        y = scale * (along + b**2)
+        k = ratio(y)
+        slope = k + (3 * (1 - k) - y * k**2 / 3) * b**2 / (along + b**2 + TINY)
+        b = b + (normal - b - chi * b * k) / (1 + chi * slope)
     return b
 
 
-def _ratios(y: Array) -> tuple[Array, Array, Array]:
-    """6 ln (sinh x/x)/x², 3 L(x)/x and the derivative of this by y = x², which is near zero a series."""
-    small, x = y < SMALL, np.sqrt(np.maximum(y, SMALL))
-    k = 3 * (x / np.tanh(x) - 1) / x**2
-    slope = (3 * (1 / np.tanh(x) - 4 * x / (np.exp(x) - np.exp(-x)) ** 2) / x - 2 * k) / (2 * x**2)
-    w = 6 * (x + np.log((1 - np.exp(-2 * x)) / (2 * x))) / x**2
-    series = _series(y)
-    return tuple(np.where(small, *pair) for pair in zip(series, (w, k, slope), strict=True))  # type: ignore[return-value]
+def _ratio(y: Array) -> Array:
+    x = np.sqrt(np.maximum(y, SMALL))
+    return np.asarray(np.where(y < SMALL, _series(y)[1], 3 * (x / np.tanh(x) - 1) / x**2))
 
 
-def _smooth(y: Expr) -> tuple[Expr, Expr, Expr]:
+def _ratio_of(y: Expr) -> Expr:
     """The same of an expression."""
     small = ufl.lt(y, SMALL)
     x = ufl.sqrt(ufl.conditional(small, SMALL, y))
-    e = ufl.exp(-2 * x)
-    coth = (1 + e) / (1 - e)
-    k = 3 * (x * coth - 1) / x**2
-    slope = (3 * (coth - 4 * x * e / (1 - e) ** 2) / x - 2 * k) / (2 * x**2)
-    w = 6 * (x + ufl.ln((1 - e) / (2 * x))) / x**2
-    w, k, slope = (ufl.conditional(small, *pair) for pair in zip(_series(y), (w, k, slope), strict=True))
-    return w, k, slope
+    return ufl.conditional(small, _series(y)[1], 3 * (x * (1 + 2 / (ufl.exp(2 * x) - 1)) - 1) / x**2)
 
 
-def _series(y: Any) -> tuple[Any, Any, Any]:
-    """Of ln (sinh x/x) to x^10."""
+def _coenergy(y: Expr) -> Expr:
+    """6 ln (sinh x/x)/x² of x²."""
+    small = ufl.lt(y, SMALL)
+    x = ufl.sqrt(ufl.conditional(small, SMALL, y))
+    return ufl.conditional(small, _series(y)[0], 6 * (x + ufl.ln((1 - ufl.exp(-2 * x)) / (2 * x))) / x**2)
+
+
+def _series(y: Any) -> tuple[Any, Any]:
+    """Of both near zero."""
     w = 1 - y * (1 / 30 - y * (2 / 945 - y * (1 / 6300 - y * 2 / 155925)))
-    k = 1 - y * (1 / 15 - y * (2 / 315 - y * (1 / 1575 - y * 2 / 31185)))
-    slope = -1 / 15 + y * (4 / 315 - y * (3 / 1575 - y * 8 / 31185))
-    return w, k, slope
+    return w, 1 - y * (1 / 15 - y * (2 / 315 - y * (1 / 1575 - y * 2 / 31185)))
 
 
 def across(H: Expr, n0: Expr) -> Expr:

@@ -5,6 +5,8 @@ would have it. With polar coordinates and r = s sinh v a rule is exact for charg
 r dr dangle takes the pole away, and for those in two at a distance s: both faces, with the same points.
 """
 
+from itertools import pairwise
+
 import basix
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +76,7 @@ def _sectors(V: Array, inside: bool) -> list[tuple[Array, Array]]:
     towards = V.mean(axis=0)
     angle = [np.arctan2(_turn(towards, v), towards @ v) for v in V]
     order = np.argsort(angle)
-    return [(V[i], V[j]) for i, j in zip(order, order[1:], strict=False) if angle[j] - angle[i] > THIN]
+    return [(V[i], V[j]) for i, j in pairwise(order) if angle[j] - angle[i] > THIN]
 
 
 def _cuts(lines: Array, starts: Array, rays: Array) -> Array:
@@ -108,7 +110,7 @@ def at_corner(corner: int) -> tuple[Array, Array]:
     (a, wa), (b, wb) = gauss(6), gauss(5)
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
     side = A - V + b[:, None] * (B - A)
-    return (V + a[:, None, None] * side).reshape(-1, 2), np.outer(wa * a, wb).ravel()
+    return (V + a[:, None, None] * side).reshape(-1, 2), np.asarray(np.outer(wa * a, wb).ravel(), dtype=np.float64)
 
 
 def on_edge(edge: int, t: Array) -> Array:
@@ -131,7 +133,7 @@ def strip() -> tuple[Array, Array, Array]:
     (x, wt), (eta, we) = (gauss(n) for n in STRIP)
     t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends
     a, b = (each.ravel() for each in np.meshgrid(t, eta, indexing="ij"))
-    return a, b, np.outer(wt, we).ravel()
+    return a, b, np.asarray(np.outer(wt, we).ravel(), dtype=np.float64)
 
 
 def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
@@ -150,4 +152,4 @@ def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
                 r = bottom + (top - bottom) * v
                 along = t + way * scale * np.sinh(r)
                 found.append((along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r)))
-    return tuple(np.concatenate(each) for each in zip(*found, strict=True))  # type: ignore[return-value]
+    return tuple(np.concatenate(each) for each in zip(*found, strict=True))

@@ -96,7 +96,7 @@ def test_derivatives(model: Any, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_inertia(model: Any, tmp_path: Path) -> None:
-    """Negative pivots of the factors are the negative eigenvalues of the dense matrix, with 1 and 1e5 times the field."""
+    """Negative pivots of the factors are the dense matrix's negative eigenvalues, with 1 and 1e5 times the energy."""
     scene = alone(tmp_path / "strip.msh", 0.25, 0)
     system, counts = scene.model.system, []
     for factor in (1.0, 1e5):

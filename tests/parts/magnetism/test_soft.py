@@ -248,7 +248,7 @@ def test_a_saturating_strip_is_an_elastica() -> None:
 
 @pytest.mark.parametrize(("B", "error"), [(1e-3, 1e-4), (50.0, 2e-2)])
 def test_limits_of_saturation(B: float, error: float) -> None:
-    """In a weak field the law is linear to O(B²), in a strong one the polarisation is the saturation along the field."""
+    """A weak field has the linear law to O(B²); a strong one the saturation, along itself."""
     magnetic = {"susceptibility": 2, "saturation": "0.5 T", "applied": {"polar": 40, "flux_density": f"{B} T"}}
     found = made(PLATE, LEFT, magnetic, **SIZED)
     row = found.observe(State(found.model.zero(), {"lambda_m": found.problem.lambda_m}))
