@@ -138,10 +138,10 @@ class InteractionTerm:
         assert self._near
         own, local, nodes = self._cells.own, self._u.function_space.dofmap.list, self._cells.nodes
         for first, second, H in self._near.stiffness(nodes_of_cells):
-            for c, d, part in zip(first, second, H, strict=True):
+            for i, (c, d) in enumerate(zip(first, second, strict=True)):
                 if c in own:
                     at = local[c - own.start][:, None], slice(None), nodes[d], slice(None)
-                    rows[at] += factor * part.transpose(1, 3, 0, 2)
+                    rows[at] += factor * H[i].transpose(1, 3, 0, 2)
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""

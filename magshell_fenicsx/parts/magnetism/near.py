@@ -120,10 +120,11 @@ class Near:
         self._scale = float(shape.h / np.median(sides))
         self._heights = heights(Faces(shape, np.arange(1)))
         meeting: dict[int, list[int]] = {}
-        for cell, three in enumerate(corners.tolist()):
+        numbers = [[int(each) for each in corners[cell]] for cell in range(len(corners))]
+        for cell, three in enumerate(numbers):
             for each in three:
                 meeting.setdefault(each, []).append(cell)
-        self.touching = [sorted({other for each in three for other in meeting[each]}) for three in corners.tolist()]
+        self.touching = [sorted({other for each in three for other in meeting[each]}) for three in numbers]
         self._free = self._at_boundary()
         kinds: dict[Kind, list[tuple[int, int]]] = {}
         for c, others in enumerate(self.touching):
