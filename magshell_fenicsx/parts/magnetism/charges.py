@@ -13,6 +13,7 @@ from the place: exact at any distance, as there is nothing else in it but the th
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ class TooNear(ValueError):
     """A place is on the surface of the shell, or in it."""
 
 
+@cache
 def gauss(n: int) -> tuple[Array, Array]:
     """Points in [0, 1] and weights."""
     x, w = np.polynomial.legendre.leggauss(n)

@@ -4,8 +4,9 @@ The charges of `charges` stay with the material, so the energy of parts A and B 
 
     W = sum of q_i q_j/|x_i - x_j|, i in A, j in B,    x = r + zeta n,
 
-a function of the displacement by the places alone: forces and stiffness are its derivatives, exact for the rule. Each
-pair of cells has a Gauss rule whose error is below `PRECISION` at their distance (`degree`), the same for both.
+and that of a part in its own field half of this, with both in A: functions of the displacement by the places alone.
+Forces and stiffness are their derivatives, exact for the rule. Each pair of cells has a Gauss rule whose error is below
+`PRECISION` at their distance (`degree`), the same for both; for those that touch see `near`.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
 from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
@@ -29,7 +31,6 @@ Ints = NDArray[np.intp]
 DEGREES = (3, 5, 7, 10, 14, 20, 30)  # of the rules on triangles that there are
 PRECISION = 1e-5  # of a pair of cells at their distance
 BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
-NOTHING = 1e-13  # of the largest charge: a face or an edge without any
 MOST = 4_000_000  # pairs of charges with second derivatives at once
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
 SPACE = 1e-3  # of cells that touch, over their size
@@ -153,7 +154,7 @@ class Placed:
     def of(cls, kind: Kind, which: int, nodes: Array, used: NDArray[np.bool_]) -> "Placed":
         """Of the elements in the cells that are used; `nodes` (cells, k, 3) are the deformed ones."""
         rule, some = kind.rule(which), used[kind.cells]
-        r, r1, r2 = np.einsum("dpk,nki->dnpi", rule.tables, nodes[kind.cells[some]])
+        r, r1, r2 = np.einsum("dpk,nki->dnpi", rule.tables, nodes[kind.cells[some]], optimize=True)
         m = np.cross(r1, r2)
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         n = m / size
@@ -162,7 +163,7 @@ class Placed:
         x = r[:, :, None] + (t[..., None] * rule.heights)[..., None] * n[:, :, None]
         number = np.full(len(kind.number), -1)
         number[kind.cells[some]] = np.arange(int(some.sum()))
-        return cls(rule, number, np.ascontiguousarray(x.reshape(len(x), -1, 3)), rule.q[some], n, up, t)
+        return cls(rule, number, np.ascontiguousarray(x.reshape(len(x), rule.q.shape[1], 3)), rule.q[some], n, up, t)
 
     @cached_property
     def levers(self) -> Array:
@@ -173,6 +174,16 @@ class Placed:
         for i in range(3):
             B[..., i, :, i] += T[0][:, None]
         return np.ascontiguousarray(B.reshape(count, -1, 3 * T.shape[2]))
+
+    def along(self, at: int, g: Array) -> Array:
+        """(k, 3) the derivative by one element's nodes, from that by its charges' places g (P L, 3)."""
+        T, n, up = self.rule.tables, self.n[at], self.up[:, at]
+        each = g.reshape(len(n), -1, 3)
+        W = self.t[at][:, None] * np.einsum("l,pli->pi", self.rule.heights, each)
+        found = T[0].T @ each.sum(axis=1)
+        for shapes, a in zip(T[1:], up, strict=True):
+            found -= shapes.T @ (np.sum(W * a, axis=-1, keepdims=True) * n)
+        return np.asarray(found)
 
     def bent(self, at: int, g: Array) -> Array:
         """(3 k, 3 k) what forces g (P L, 3) on one element's charges add to the stiffness, as its normals turn."""
@@ -190,7 +201,7 @@ Sink = Callable[[int, Array], None]
 
 
 class Charged:
-    """All charges of a shell, of which those of different parts act on each other.
+    """All charges of a shell, of which those of different parts act on each other, or all.
 
     Parameters
     ----------
@@ -200,18 +211,22 @@ class Charged:
         (cells,) the number of each one's part.
     cells, edges
         Edges that may be charged, by cell and local number.
+    near
+        The pairs of cells that touch, where each part acts on itself too; None where it does not.
     """
 
-    def __init__(self, shape: Shape, parts: Ints, cells: Ints, edges: Ints, comm: MPI.Comm) -> None:
+    def __init__(
+        self, shape: Shape, parts: Ints, cells: Ints, edges: Ints, comm: MPI.Comm, near: Near | None = None
+    ) -> None:
         self._ffi, self._lib = native(Path(__file__).with_name("coulomb.c"), FUNCTIONS, comm)
-        self._parts, self._h = parts, shape.h
+        self._parts, self._h, self._near = parts, shape.h, near
         kinds = [Kind(shape, np.arange(len(shape.r0)))]
         kinds += [Kind(shape, cells[edges == edge], edge) for edge in range(3) if (edges == edge).any()]
         sizes = [kind.charged(0) for kind in kinds]
         self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if size > NOTHING * max(sizes)]
 
     def rules(self, nodes: Array, own: range) -> NDArray[np.int8]:
-        """(own, cells) the number in `DEGREES` of the rule of each pair of cells; -1 of those of one part.
+        """(own, cells) the number in `DEGREES` of the rule of each pair of cells; -1 of those that have none here.
 
         Raises
         ------
@@ -224,7 +239,11 @@ class Charged:
         radius = np.linalg.norm(nodes - centre[:, None], axis=-1).max(axis=1)
         found = np.full((len(own), len(nodes)), -1, dtype=np.int8)
         for row, cell in enumerate(own):
-            others = np.flatnonzero(self._parts != self._parts[cell])
+            apart = self._parts != self._parts[cell]
+            if self._near:
+                apart[:] = True
+                apart[self._near.touching[cell]] = False
+            others = np.flatnonzero(apart)
             size = 2 * np.maximum(radius[others], radius[cell])
             gap = np.linalg.norm(centre[others] - centre[cell], axis=-1) - radius[others] - radius[cell] - self._h
             close = gap < size
@@ -248,7 +267,8 @@ class Charged:
         nodes
             (cells, k, 3) the deformed ones.
         sink
-            Gets the second derivatives (3 k, cells, 3 k) by the nodes of each own cell and those of all cells.
+            Gets the second derivatives (3 k, cells, 3 k) by the nodes of each own cell and those of all cells, without
+            those of cells that touch.
 
         Raises
         ------
@@ -274,6 +294,10 @@ class Charged:
                         gradient[row] += slope
             if sink and stiffness is not None:
                 sink(row, stiffness)
+        if self._near:
+            slope = np.zeros_like(nodes)
+            energy += self._near.add(nodes, slope)
+            gradient += slope[own.start : own.stop]
         return energy, gradient
 
     def _seen(
@@ -282,7 +306,8 @@ class Charged:
         """The energy of an element of a cell among others, and its gradient (k, 3); its stiffness is added."""
         at = int(of.number[cell])
         x, q, energy = of.x[at], np.ascontiguousarray(of.q[at]), 0.0
-        B, g, H = of.levers[at], np.zeros_like(x), np.zeros((len(x), 3, 3))
+        g, H = np.zeros_like(x), np.zeros((len(x), 3, 3))
+        B = of.levers[at] if stiffness is not None else None
         for source in kinds:
             cells = others[source.number[others] >= 0]
             each = max(1, MOST // (len(x) * source.x.shape[1]))
@@ -292,14 +317,14 @@ class Charged:
                 y, p = source.x[there].reshape(-1, 3), source.q[there].ravel()
                 K = np.empty((3 * len(x), 3 * len(y))) if stiffness is not None else None
                 energy += self._sum(x, q, y, p, g, H, K)
-                if stiffness is not None and K is not None:
+                if stiffness is not None and K is not None and B is not None:
                     left = (B.T @ K).reshape(len(B.T), len(some), -1).transpose(1, 0, 2)
                     stiffness[:, some] += np.matmul(left, source.levers[there]).transpose(1, 0, 2)
-        if stiffness is not None:
+        if stiffness is not None and B is not None:
             each_B = B.reshape(len(x), 3, -1)
             own = np.einsum("mia,mib->ab", each_B, np.matmul(H, each_B))
             stiffness[:, cell] += own + of.bent(at, g)
-        return energy, (g.ravel() @ B).reshape(-1, 3)
+        return energy, of.along(at, g)
 
     def _sum(self, x: Array, q: Array, y: Array, p: Array, g: Array, H: Array, K: Array | None) -> float:
         def pointer(array: Array | None) -> Any:

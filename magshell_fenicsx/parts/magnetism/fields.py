@@ -203,9 +203,13 @@ class MagneticSection(Section, Ability):
     """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a number, a formula of
     the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
     flux densities, and always energy: full"""
-    interaction: Literal["none", "others"] = "none"
+    saturation: FluxDensity | None = Field(default=None, gt=0, le=1e3)
+    """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in proportion to the field.
+    It needs a susceptibility and flux densities"""
+    interaction: Literal["none", "others", "all"] = "none"
     """Whether parts of the shell that are not connected, those of a mesh file, act on each other with their own fields
-    (others), or feel the applied field alone (none). It needs remanent.flux_density and shell.youngs_modulus"""
+    (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs
+    remanent.flux_density and shell.youngs_modulus"""
     remanent: RemanentSection | None = RemanentSection.model_construct()
     """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""
     applied: AppliedSection = AppliedSection.model_construct()
@@ -223,6 +227,11 @@ class MagneticSection(Section, Ability):
     def _what_is_soft(self) -> Self:
         if self.remanent is None and self.susceptibility is None:
             raise ValueError("remanent: none is of a shell with a susceptibility: give that, or leave remanent out")
+        if self.saturation is not None and (self.susceptibility is None or self.lambda_m is not None):
+            raise ValueError(
+                "saturation: is of a shell with a susceptibility in a field in tesla: give susceptibility and "
+                "applied.flux_density (or sources), without lambda_m"
+            )
         if self.susceptibility is not None and self.energy != "full":
             raise ValueError(f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs full")
         if self.susceptibility is not None and self.remanent and self.lambda_m is not None:

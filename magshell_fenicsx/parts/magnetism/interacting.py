@@ -15,6 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
+from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.parts.seen import Sight
 
@@ -27,7 +28,7 @@ LARGEST = 9000  # unknowns: a matrix of 650 MB
 
 
 class InteractionTerm:
-    """The energy over E h R² of the parts of a model in each other's field, with the amplitude `interaction`.
+    """The energy over E h R² of the parts of a model in each other's and their own field; its amplitude: `interaction`.
 
     Raises
     ------
@@ -39,6 +40,7 @@ class InteractionTerm:
 
     def __init__(self, model: "Observed", u: fem.Function, of: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE
+        self._itself = of.itself
         self._model, self._u = model, u
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
@@ -49,14 +51,14 @@ class InteractionTerm:
         self._to_nodes = coo_array(ones, (V.dofmap.index_map.size_global, nodes.size)).tocsr()  # from those of cells
         self._parts = self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]])  # of each cell
         unknowns = 3 * V.dofmap.index_map.size_global
-        if self._parts.max() == 0:
+        if not of.itself and self._parts.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between parts of a mesh file that are not connected, and the shell "
-                "is one part: take interaction: none, or a mesh of several parts"
+                "is one part: take interaction: all, or a mesh of several parts"
             )
         if unknowns > LARGEST:
             raise CaseError(
-                f"magnetic.interaction: others: the model has {unknowns} unknowns; as all of them act on each other, "
+                f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on each other, "
                 f"at most {LARGEST} are allowed: take a coarser mesh or a lower mesh.degree"
             )
         self._given: tuple[Array, ...] = ()
@@ -114,6 +116,18 @@ class InteractionTerm:
             self._charged.evaluate(nodes, self._cells.own, add)
         except Touching:
             rows[:] = np.nan
+        if self._near:
+            self._add_near(nodes, rows, factor * self._scale)
+
+    def _add_near(self, nodes_of_cells: Array, rows: Array, factor: float) -> None:
+        """What cells that touch add to the rows of nodes of own cells."""
+        assert self._near
+        own, local, nodes = self._cells.own, self._u.function_space.dofmap.list, self._cells.nodes
+        for first, second, H in self._near.stiffness(nodes_of_cells):
+            for i, (c, d) in enumerate(zip(first, second, strict=True)):
+                if c in own:
+                    at = local[c - own.start][:, None], slice(None), nodes[d], slice(None)
+                    rows[at] += factor * H[i].transpose(1, 3, 0, 2)
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""
@@ -134,19 +148,31 @@ class InteractionTerm:
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._seen = given, None
-            self.__dict__.pop("_charged", None)
+            for name in ("_charged", "_near"):
+                self.__dict__.pop(name, None)
         return np.asarray((r0 + u)[self._cells.nodes])
 
     @cached_property
     def _charged(self) -> Charged:
+        shape, cells, edges = self._all()
+        return Charged(shape, self._parts, cells, edges, self._comm, self._near)
+
+    @cached_property
+    def _near(self) -> Near | None:
+        shape, cells, edges = self._all()
+        if not self._itself:
+            return None
+        return Near(shape, self._cells.nodes[:, :3], cells, edges, self._cells.own, self._comm)
+
+    def _all(self) -> tuple[Shape, Ints, Ints]:
+        """The cells of all ranks, and their edges that may be charged; collective."""
         own = own_field(self._sight)
         shape, (cells, edges) = own.shape({}), own.edges
         thick = shape.thick and (shape.thick[0], self._cells.gathered(shape.thick[1]))
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
         everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
         own_cells, every = np.asarray(cells) + self._cells.own.start, self._comm
-        at = over_ranks(every, own_cells), over_ranks(every, np.asarray(edges))
-        return Charged(everywhere, self._parts, *at, self._comm)
+        return everywhere, over_ranks(every, own_cells), over_ranks(every, np.asarray(edges))
 
     @property
     def _sight(self) -> Sight:

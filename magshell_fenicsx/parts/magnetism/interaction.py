@@ -29,9 +29,12 @@ class Interaction:
     ----------
     strength
         |Br|²/(mu_0 E).
+    itself
+        Whether each part acts on itself, too.
     """
 
     strength: float
+    itself: bool = False
 
 
 class InteractionStep(PathStep):
@@ -64,7 +67,7 @@ class InteractionStep(PathStep):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not acts(context):
-            raise ValueError(f"{step.key}.kind: interaction needs magnetic.interaction: others")
+            raise ValueError(f"{step.key}.kind: interaction needs magnetic.interaction: others or all")
 
 
 class InteractionBefore(InteractionStep):
@@ -99,7 +102,7 @@ def interaction(context: Context) -> Interaction | None:
     assert magnetic.remanent
     assert magnetic.remanent.flux_density
     assert E
-    return Interaction(magnetic.remanent.flux_density**2 / (MU_0 * E))
+    return Interaction(magnetic.remanent.flux_density**2 / (MU_0 * E), magnetic.interaction == "all")
 
 
 def refuse_unfit_interaction(context: Context) -> None:
@@ -123,10 +126,10 @@ def refuse_unfit_interaction(context: Context) -> None:
             f"magnetic.interaction: {magnetic.interaction}: shell.youngs_modulus has no unit: give it in pascals, and "
             "lengths in units"
         )
-    if not isinstance(context.shell, MeshSurface):
+    if magnetic.interaction == "others" and not isinstance(context.shell, MeshSurface):
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file that are not connected: "
-            "take geometry: mesh, or interaction: none"
+            "take geometry: mesh, or interaction: all or none"
         )
     if context.whole and AMPLITUDE not in {step.name for step in context.steps}:
         raise CaseError(

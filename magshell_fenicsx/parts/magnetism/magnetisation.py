@@ -235,6 +235,7 @@ def account(context: Context, loads: Loads) -> Account:
         chi, beside = magnetic.susceptibility, "without remanence" if field.soft.alone else "beside the remanence"
         chi = f"{chi:g}" if isinstance(chi, int | float) else chi
         law += f", soft magnetism of a sheet with the susceptibility {chi} {beside}"
+        law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
     sources = enumerate(magnetic.applied.sources or [])
     words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
     return Account([f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words])

@@ -42,7 +42,8 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | 
         pattern = WithinRims(rims, rest) if rims else float(rest[0])
     scale = sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
-    return Soft(pattern, scale, tesla, remanent is None, patches or None)
+    largest = None if magnetic.saturation is None else magnetic.saturation / tesla
+    return Soft(pattern, scale, tesla, remanent is None, patches or None, largest)
 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:

@@ -64,6 +64,13 @@ KINDS = {
     "solid, turned": lambda: made(
         PLATE, LEFT, {"susceptibility": "1 + x", "applied": FIELD}, model="solid", loading=TURNED, mesh={"size": 0.015}
     ),
+    "saturating": lambda: made(
+        PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "applied": FIELD}, loading=TURNED, **SIZED
+    ),
+    "solid, saturating": lambda: made(
+        PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "remanent": REMANENT, "applied": G},
+        model="solid", mesh={"size": 0.015},
+    ),
 }  # fmt: skip
 
 
@@ -199,6 +206,70 @@ def test_a_strip_across_a_field_is_an_elastica(ratio: float) -> None:
     assert branches[1]["tip_uz"] == pytest.approx(-branches[2]["tip_uz"], rel=1e-6)
 
 
+def langevin(chi: float, J: float, normal: float, along: float) -> tuple[float, float]:
+    """mu0 M across and along a sheet in the field B; B_n = mu0 (H_n + M_n) by bisection."""
+
+    def size(b: float) -> float:
+        x = 3 * chi * b / J
+        return J * (1 / np.tanh(x) - 1 / x) if x > 1e-4 else chi * b
+
+    def left(b: float) -> float:
+        total = np.hypot(b, along)
+        return abs(normal) - b - size(total) * b / (total or 1.0)
+
+    b = float(brentq(left, 0, abs(normal), xtol=1e-16)) * np.sign(normal)
+    total = np.hypot(b, along)
+    return size(total) * b / total, size(total) * along / total
+
+
+def test_a_saturating_strip_is_an_elastica() -> None:
+    """The tip in a field beyond saturation, of SciPy's elastica with the same law: 1e-4."""
+    chi, J, B, slender, angle = 5.0, 4e-3, 6e-3, 200, np.radians(20)
+    unit = np.sqrt(4e-7 * np.pi * 1e6)
+
+    def rates(_: float, y: np.ndarray) -> list[float]:
+        normal, along = B / unit * np.cos(angle + y[0]), B / unit * np.sin(angle + y[0])
+        Jn, Jt = langevin(chi, J / unit, normal, along)
+        return [y[1], -12 * slender**2 * (Jt * normal - Jn * along), np.cos(y[0]), np.sin(y[0])]
+
+    def end(slope: float) -> np.ndarray:
+        return np.asarray(solve_ivp(rates, (0, 1), [0, slope, 0, 0], rtol=1e-9, atol=1e-11).y[:, -1])
+
+    slope = brentq(lambda slope: end(slope)[1], 0.0, 3.0, xtol=1e-10)
+    x, z = end(float(slope))[2:]
+    shell = {"geometry": "strip", "radius": "30 mm", "width": 0.1, "thickness": "0.15 mm", "youngs_modulus": "1 MPa"}
+    magnetic = {"susceptibility": chi, "saturation": f"{J} T"}
+    magnetic["applied"] = {"polar": 20, "azimuth": 0, "flux_density": f"{B} T"}
+    case = {"shell": {**shell, "poisson_ratio": 0}, "boundary": {"root": "clamped"}, "magnetic": magnetic}
+    row = run(Case.model_validate({**case, "points": {"tip": ["30 mm", 0, 0]}, "loading": {"kind": "field"}})).rows[-1]
+    assert z > 0.2
+    assert [row["tip_ux_mm"] / 30, row["tip_uz_mm"] / 30] == pytest.approx([x - 1, z], abs=1e-4)
+
+
+@pytest.mark.parametrize(("B", "error"), [(1e-3, 1e-4), (50.0, 2e-2)])
+def test_limits_of_saturation(B: float, error: float) -> None:
+    """A weak field has the linear law to O(B²); a strong one the saturation, along itself."""
+    magnetic = {"susceptibility": 2, "saturation": "0.5 T", "applied": {"polar": 40, "flux_density": f"{B} T"}}
+    found = made(PLATE, LEFT, magnetic, **SIZED)
+    row = found.observe(State(found.model.zero(), {"lambda_m": found.problem.lambda_m}))
+    s, c = np.sin(np.radians(40)), np.cos(np.radians(40))
+    along, across = (2 * B * s, 2 / 3 * B * c) if B < 1 else (0.5 * s, 0.5 * c)
+    assert [row["induced_x"], row["induced_z"]] == pytest.approx([along, across], rel=error)
+
+
+@pytest.mark.parametrize(("chi", "R_over_h"), [(0.5, 50), (5.0, 200)])
+def test_a_sphere_in_a_uniform_field(chi: float, R_over_h: float) -> None:
+    """The moment of a spherical shell (Jackson, Classical Electrodynamics, equation 5.121), but for O(chi h/R)."""
+    shell = {"geometry": "hemisphere", "radius_to_thickness": R_over_h}
+    magnetic = {"susceptibility": chi, "lambda_m": 1e-3, "applied": {"polar": 0}}
+    found = made(shell, {"equator": "clamped"}, magnetic, symmetry="axisymmetric")
+    row = found.observe(State(found.model.zero(), {"lambda_m": 1e-3}))
+    mu, a, b = 1 + chi, 1 - 0.5 / R_over_h, 1 + 0.5 / R_over_h
+    alpha = (2 * mu + 1) * (mu - 1) / ((2 * mu + 1) * (mu + 2) - 2 * (a / b) ** 3 * (mu - 1) ** 2) * (b**3 - a**3)
+    exact = 3 * alpha / (b**3 - a**3) * 1e-3  # mu0 M, mean over the shell
+    assert row["induced_z"] == pytest.approx(exact, rel=chi / R_over_h)
+
+
 def test_critical_field_as_a_solid() -> None:
     """The body's strip of L/h = 20 buckles at the same field, but for what shear and thickness change: O((h/L)²)."""
     case = {
@@ -253,6 +324,9 @@ def test_gradient_by_susceptibility() -> None:
         ({"susceptibility": 2, "lambda_m": 1e-3, "applied": {"flux_density": "0.1 T"}}, "not both"),
         ({"susceptibility": 2, "applied": {"polar": 1}}, "give lambda_m, or applied.flux_density"),
         ({"susceptibility": 2, "lambda_m": 1e-3, "remanence": "rotation"}, "which this shell has not"),
+        ({"susceptibility": 2, "saturation": "0.5 T", "lambda_m": 1e-3}, "in a field in tesla"),
+        ({"saturation": "0.5 T", "remanent": {}, "lambda_m": 1e-3}, "of a shell with a susceptibility"),
+        ({"susceptibility": 2, "saturation": "-1 T", "applied": {"flux_density": "1 T"}}, "saturation"),
         ({"remanent": None, "lambda_m": 1e-3}, "shell with a susceptibility"),
         ({"susceptibility": {"dimple": 2}, "lambda_m": 1e-3}, "no dimple"),
         ({"susceptibility": "x - 0.5", "lambda_m": 1e-3}, "magnetic.susceptibility: 'x - 0.5': is"),

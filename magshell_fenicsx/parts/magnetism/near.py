@@ -1,0 +1,333 @@
+"""The energy of the charges of cells that touch each other, and of each cell with itself.
+
+The charges of one cell act on those of its neighbours, of the same part of a shell, at distances from zero on. As they
+stay with the material, energy, forces and stiffness are derivatives of one sum over pairs of points; only their rules
+are others than far away (`touching`), the same for all pairs of one kind.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import basix
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.magnetism.charged import Shape
+from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.touching import (
+    APART,
+    ENDS,
+    SPLIT,
+    along_strip,
+    around,
+    at_corner,
+    beyond,
+    on_edge,
+    polar,
+    strip,
+)
+from magshell_fenicsx.platform.native import native
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+NOTHING = 1e-13  # of the largest charge: elements without any
+CHUNK = 40_000  # points at which charges are found at once
+ON_STRIP = (8, 4)  # nodes along and across a strip at which charges are found; between them they are polynomials
+NODES = basix.create_element(
+    basix.ElementFamily.P,
+    basix.CellType.triangle,
+    8,
+    lagrange_variant=basix.LagrangeVariant.gl_isaac,
+    discontinuous=True,
+)
+FUNCTIONS = """
+    double near(int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *, const double *,
+        const double *, const double *, int64_t, int64_t, const double *, const double *, const double *,
+        const double *, int64_t, double *, double *);
+"""
+Kind = tuple[Any, ...]  # of a pair of elements: the first one with its sides, the second, and where they touch
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of elements of one kind.
+
+    Attributes
+    ----------
+    X
+        (n, 2) on the reference triangle.
+    weights
+        (n,)
+    at
+        Coordinates (n, 2) of a strip, in [0, 1]; None of faces.
+    """
+
+    X: Array
+    weights: Array
+    at: Array | None = None
+
+    @classmethod
+    def of_strip(cls, edge: int, t: Array, eta: Array, weights: Array) -> "Points":
+        return cls(on_edge(edge, t), weights, np.column_stack([t, eta]))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Pairs of one kind, with what `near.c` takes.
+
+    Attributes
+    ----------
+    factor
+        1/2 where the pair stands in both orders.
+    own
+        How many of the first pairs have their first cell on this rank.
+    """
+
+    pairs: Ints
+    factor: float
+    own: int
+    left: tuple[Array, ...]
+    right: tuple[Array, ...]
+    same: bool
+
+
+class Near:
+    """All pairs of cells with a common node.
+
+    Parameters
+    ----------
+    shape
+        All cells.
+    corners
+        (cells, 3) numbers of their corners.
+    cells, edges
+        Edges that may be charged, by cell and local number.
+    own
+        The cells of this rank; pairs without one of them are left to others.
+    """
+
+    def __init__(self, shape: Shape, corners: Ints, cells: Ints, edges: Ints, own: range, comm: MPI.Comm) -> None:
+        self._ffi, self._lib = native(Path(__file__).with_name("near.c"), FUNCTIONS, comm)
+        self._shape, self._corners, self._own = shape, corners, own
+        strips = np.zeros((len(corners), 3), dtype=bool)
+        strips[cells, edges] = True
+        self._strips = strips
+        sides = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
+        self._scale = float(shape.h / np.median(sides))
+        self._heights = heights(Faces(shape, np.arange(1)))
+        meeting: dict[int, list[int]] = {}
+        numbers = [[int(each) for each in corners[cell]] for cell in range(len(corners))]
+        for cell, three in enumerate(numbers):
+            for each in three:
+                meeting.setdefault(each, []).append(cell)
+        self.touching = [sorted({other for each in three for other in meeting[each]}) for three in numbers]
+        self._free = self._at_boundary()
+        kinds: dict[Kind, list[tuple[int, int]]] = {}
+        for c, others in enumerate(self.touching):
+            for d in others:
+                if c in own or d in own:
+                    for kind in self._kinds(c, d):
+                        kinds.setdefault(kind, []).append((c, d))
+        self._most = 0.0
+        self._batches = list(self._charged(kinds))
+
+    def add(self, nodes: Array, gradient: Array) -> float:
+        """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added, right for own cells."""
+        return sum(self._evaluate(each, nodes, gradient, None) for each in self._batches)
+
+    def stiffness(self, nodes: Array) -> Iterator[tuple[Ints, Ints, Array]]:
+        """Rows and columns (n,) of cells, and (n, 3, k, 3, k) second derivatives: the component before the node."""
+        k, unused = nodes.shape[1], np.zeros_like(nodes)
+        for each in self._batches:
+            H = np.zeros((len(each.pairs), 3, 3, k, 3, k))
+            self._evaluate(each, nodes, unused, H)
+            c, d = each.pairs.T
+            cross = each.factor * H[:, 1]
+            yield c, c, each.factor * H[:, 0]
+            yield d, d, each.factor * H[:, 2]
+            yield c, d, cross
+            yield d, c, cross.transpose(0, 3, 4, 1, 2)
+
+    def _evaluate(self, batch: Batch, nodes: Array, gradient: Array, H: Array | None) -> float:
+        slope = np.zeros_like(gradient)
+        energy = 0.0
+        for part in (slice(0, batch.own), slice(batch.own, None)):
+            if not len(pairs := batch.pairs[part]):
+                continue
+            TL, tL, hL, qL = batch.left
+            TR, tR, hR, qR = batch.right
+            arrays = [pairs, nodes, TL, tL[part], hL, qL[part], TR, tR[part], hR, qR[part], slope]
+            p = [self._ffi.from_buffer("int64_t[]", arrays[0])]
+            p += [self._ffi.from_buffer("double[]", np.ascontiguousarray(each)) for each in arrays[1:]]
+            into = self._ffi.NULL if H is None else self._ffi.from_buffer("double[]", H[part])
+            sizes = qL.shape[1:], (qR.shape[-2] if batch.same else TR.shape[1], qR.shape[-1])
+            value = self._lib.near(
+                len(pairs), p[0], nodes.shape[1], p[1], *sizes[0], *p[2:6], *sizes[1], *p[6:10], batch.same, p[10], into
+            )
+            energy += value if part.start == 0 else 0.0
+        gradient += batch.factor * slope
+        return batch.factor * energy
+
+    def _at_boundary(self) -> NDArray[np.bool_]:
+        """(cells, 3) sides that no other cell has."""
+        found = np.ones((len(self._corners), 3), dtype=bool)
+        for c, others in enumerate(self.touching):
+            for d in others:
+                for edge in range(3):
+                    if c != d and self._shared(c, edge, d):
+                        found[c, edge] = False
+        return found
+
+    def _shared(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
+        """The local number in d of a side of c, and whether it runs the other way."""
+        a, b = (int(self._corners[c, i]) for i in ENDS[edge])
+        for there, (i, j) in enumerate(ENDS):
+            ends = int(self._corners[d, i]), int(self._corners[d, j])
+            if ends in ((a, b), (b, a)):
+                return there, ends == (b, a)
+        return None
+
+    def _kinds(self, c: int, d: int) -> Iterator[Kind]:
+        """Of all elements of two cells that touch."""
+        mine, theirs = ([int(each) for each in self._corners[cell]] for cell in (c, d))
+        mask = tuple(map(bool, self._free[c]))
+        sides = [(e, found) for e in range(3) if c != d and (found := self._shared(c, e, d))]
+        if c == d:
+            yield "faces", mask, "self"
+        elif sides:
+            e, (there, flip) = sides[0]
+            yield "faces", mask, "side", e, there, flip
+        else:
+            yield "faces", mask, "corner", next(i for i, each in enumerate(theirs) if each in mine)
+        for e in np.flatnonzero(self._strips[c]):
+            e = int(e)
+            common, ends = self._shared(c, e, d), [mine[i] for i in ENDS[e]]
+            met = [i for i, each in enumerate(theirs) if each in ends]
+            if common:
+                yield "strip", e, "side", *common
+            else:
+                yield ("strip", e, "corner", met[0]) if met else ("strip", e, "apart")
+            for f in np.flatnonzero(self._strips[d]):
+                f = int(f)
+                other = [theirs[i] for i in ENDS[f]]
+                if common and common[0] == f:
+                    yield "strips", e, "side", f, common[1]
+                elif at := [i for i in range(2) if other[i] in ends]:
+                    yield "strips", e, "end", f, at[0], ends.index(other[at[0]])
+                else:
+                    yield "strips", e, "apart", f
+
+    def _charged(self, kinds: dict[Kind, list[tuple[int, int]]]) -> Iterator[Batch]:
+        made = []
+        for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
+            order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
+            made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
+        most = max(
+            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left[3], each.right[3])), default=0
+        )
+        for each in made:
+            if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left[3], each.right[3])):
+                yield each
+
+    def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
+        first, second, same = self._rules(kind)
+        on_strips = kind[0] == "strips"
+        left = self._found(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
+        right = self._found(pairs[:, 1], second, kind[3] if on_strips else None)
+        T, h, t, q = right
+        if not same:
+            count = len(first.weights)
+            T = T.reshape(count, -1, *T.shape[1:])
+            h, t, q = (
+                h.reshape(count, -1, h.shape[-1]),
+                t.reshape(len(t), count, -1),
+                q.reshape(len(q), count, -1, h.shape[-1]),
+            )
+        return Batch(
+            pairs, 1.0 if kind[0] == "strip" else 0.5, own, (left[0], left[2], left[1], left[3]), (T, t, h, q), same
+        )
+
+    def _rules(self, kind: Kind) -> tuple[Points, Points, bool]:
+        """Points of both elements; of the second one those for each of the first, or, if true, the same for all."""
+        s = self._scale
+        if kind[0] == "faces":
+            first = Points(*around(kind[1], s))
+            if kind[2] == "corner":
+                return first, Points(*at_corner(kind[3])), True
+            apex = first.X if kind[2] == "self" else beyond(first.X, kind[3:5], kind[5])
+            return first, self._each([polar(each, s) for each in apex]), False
+        t, eta, w = strip()
+        first = Points.of_strip(kind[1], t, eta, w)
+        if kind[0] == "strip":
+            if kind[2] == "corner":
+                return first, Points(*at_corner(kind[3])), True
+            if kind[2] == "apart":
+                return first, Points(*_quadrature(APART)), True
+            foot = on_edge(kind[3], 1 - t if kind[4] else t)
+            return first, self._each([polar(each, SPLIT * s) for each in foot]), False
+        if kind[2] in ("side", "end"):
+            at = 1 - t if kind[4] else t
+            if kind[2] == "end":  # as far from the common end as the place is, beyond it
+                at = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
+            found = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
+            return first, Points.of_strip(kind[3], *(np.concatenate(each) for each in zip(*found, strict=True))), False
+        return first, Points.of_strip(kind[3], t, eta, w), True
+
+    def _each(self, rules: list[tuple[Array, Array]]) -> Points:
+        """Rules for each of some points, made as long as the longest with points of weight zero."""
+        longest = max(len(w) for _, w in rules)
+        X = [np.concatenate([X, np.repeat(X[:1], longest - len(X), axis=0)]) for X, _ in rules]
+        w = [np.concatenate([w, np.zeros(longest - len(w))]) for _, w in rules]
+        return Points(np.concatenate(X), np.concatenate(w))
+
+    def _found(self, cells: Ints, points: Points, edge: int | None) -> tuple[Array, Array, Array, Array]:
+        """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
+        shape, X = self._shape, points.X
+        T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
+        t = shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
+        if points.at is None:
+            q = np.einsum("mj,njl->nml", NODES.tabulate(0, X)[0, :, :, 0], self._on_faces[cells], optimize=True)
+            layers = np.broadcast_to(self._heights, (len(X), len(self._heights)))
+        else:
+            assert edge is not None
+            basis = np.einsum("ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP)))
+            basis = basis.reshape(len(X), -1)
+            q, layers = (self._on_strips[edge][cells] @ basis.T)[..., None], points.at[:, 1:] - 0.5
+        return T, np.ascontiguousarray(layers), np.ascontiguousarray(t), points.weights[:, None] * q
+
+    @cached_property
+    def _on_faces(self) -> Array:
+        """(cells, n, layers) charges per area of the reference triangle at nodes."""
+        X, cells = NODES.points, np.arange(len(self._corners))
+        ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
+        each = max(1, CHUNK // len(X))
+        parts = [cells[first : first + each] for first in range(0, len(cells), each)]
+        return np.concatenate([Faces(self._shape, part).at(Boxes.whole(len(part)), ab, weights).q for part in parts])
+
+    @cached_property
+    def _on_strips(self) -> list[Array]:
+        """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
+        (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
+        at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
+        found: list[Array] = [np.zeros((len(self._corners), len(at))) for _ in range(3)]
+        for edge, into in enumerate(found):
+            cells = np.flatnonzero(self._strips[:, edge])
+            if len(cells):
+                sides = Sides(self._shape, cells, np.full(len(cells), edge))
+                into[cells] = sides.at(Boxes.whole(len(cells)), at, np.ones(len(at))).q[..., 0]
+        return found
+
+
+def _lagrange(n: int, x: Array) -> Array:
+    """(m, n) values at places of the polynomials that are one at one of Gauss's points each."""
+    V = np.polynomial.legendre.legvander
+    return np.asarray(np.linalg.solve(V(2 * gauss(n)[0] - 1, n - 1).T, V(2 * x - 1, n - 1).T).T)
+
+
+def _quadrature(degree: int) -> tuple[Array, Array]:
+    X, w = basix.make_quadrature(basix.CellType.triangle, degree)
+    return np.asarray(X), np.asarray(w)
