@@ -93,10 +93,13 @@ def _changed(case: Case, key: str, value: Any) -> Case:
     if case.several and key.split(".")[0] in ("shells", "mesh"):  # all of them are meshed anew
         return _of_data(case, key, value)
     replaced: Case = _replaced(case, key, value)
-    if written is None or not key.startswith("shell."):  # no other number is one that others are given over
+    if written is None:
         return replaced
-    other = _validated(_written(written, key, value), case, key)
-    return replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+    data = _written(written, key, value)  # which the next change builds on
+    if key.startswith("shell."):  # no other number is one that others are given over
+        other = _validated(data, case, key)
+        replaced = replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+    return replaced.written_as(replace(case.origin, data=data))
 
 
 def _of_data(case: Case, key: str, value: Any) -> Case:
@@ -123,7 +126,7 @@ def _written(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     at: Any = int(last) if isinstance(part, list) else last
     known = part[at] if isinstance(part, list) else part.get(at)
     unit = number_and_unit(known)[1] if isinstance(known, str) else ""
-    part[at] = f"{value / si_size(unit)!r} {unit}" if unit else value
+    part[at] = f"{value / si_size(unit)!r} {unit}" if unit and value is not None else value
     return found
 
 

@@ -7,6 +7,7 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.opened import changed
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 
@@ -143,3 +144,20 @@ def test_a_copy_has_a_programme_of_its_own() -> None:
     assert case.programme is case.programme
     assert len(case.programme) == 2
     assert case.model_copy(update={"loading": None}).programme == ()
+
+
+def test_changes_of_several_numbers_keep_each_other() -> None:
+    """Numbers of the shell and a target over one of them: all as in a case that has them from the start."""
+    values = {
+        "shell.poisson_ratio": 0.3,
+        "loading.pressure": 0.2,
+        "shell.thickness": 0.8e-3,
+        "shell.youngs_modulus": 2e6,
+    }
+    shell = {"geometry": "cap", "radius": "20 mm", "polar": 45, "thickness": "0.7 mm", "youngs_modulus": "1 MPa"}
+    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1}
+    data = {"shell": {**shell, "poisson_ratio": 0.5}, "boundary": {"rim": "clamped"}, "loading": loading}
+    found = changed(Case.from_source(data), values)
+    data["shell"] |= {"poisson_ratio": 0.3, "thickness": "0.8 mm", "youngs_modulus": "2 MPa"}
+    data["loading"]["pressure"] = 0.2
+    assert found.model_dump() == Case.from_source(data).model_dump()
