@@ -29,7 +29,8 @@ from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.joints import Joints
 from magshell_fenicsx.parts.kinds import Bodies
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, strength
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.natural.section import NaturalSection

@@ -20,7 +20,7 @@ from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section,
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member, Place
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
-from magshell_fenicsx.parts.magnetism.fields import RemanentSection
+from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import ShellSection, Surface

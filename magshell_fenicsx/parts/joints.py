@@ -15,8 +15,9 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
+from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
     from magshell_fenicsx.parts.natural.shape import Natural
-    from magshell_fenicsx.parts.touching.touching import Pair
+    from magshell_fenicsx.parts.touching.section import Pair
 
 
 @dataclass(frozen=True)

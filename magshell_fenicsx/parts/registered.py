@@ -59,7 +59,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "pressure.pressure.PressureSeen",
     "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
-    "magnetism.direction.FieldSeen",
+    "magnetism.readings.FieldSeen",
     "magnetism.source_step.SourcesSeen",
     "magnetism.readings.SoftSeen",
     "magnetism.interaction.InteractionSeen",

@@ -11,7 +11,8 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
+from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 
 SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)

@@ -73,14 +73,14 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         try:
             for record in walked:
                 last = record.label
-                yield _told(scene, step, record, remark, where)
+                yield _recorded(scene, step, record, remark, where)
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
             release = step.load.released_by
             if release and record and step.until == "bifurcation" and last == "bifurcation":
                 record = departure_of(scene, step, record).record(0)
                 scene = record.scene or scene
-                yield _told(scene, step, record, remark, where)
+                yield _recorded(scene, step, record, remark, where)
             elif release and record:
                 if record.label != "fold" or record.mode:
                     at = record.mode or record.label
@@ -96,7 +96,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                 walked = Walked(further)
                 for record in walked:
                     last, scene = record.label, record.scene or scene
-                    yield _told(scene, step, record, remark, where)
+                    yield _recorded(scene, step, record, remark, where)
         except (Stopped, NotANumber) as e:
             names = scene.model.system.strange
             strange = f"; where it was tried last, {' and '.join(names)} was not a number" if names else ""
@@ -111,7 +111,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
 
 
-def _told(scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str) -> Record:
+def _recorded(scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str) -> Record:
     """A record as a history gives it."""
     at = record.scene or scene
     if record.said:

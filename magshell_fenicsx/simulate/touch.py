@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.touching.touching import Pair
+from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage

@@ -17,8 +17,9 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
+from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.symmetry import Leaves, alike, mirrors_formula, tilted, unit

@@ -14,7 +14,8 @@ from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
+from magshell_fenicsx.parts.path_step import Count, PathStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
 from magshell_fenicsx.shape.symmetry import Leaves, tilted
 

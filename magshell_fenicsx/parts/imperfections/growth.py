@@ -7,8 +7,9 @@ from pydantic import Field
 
 from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:

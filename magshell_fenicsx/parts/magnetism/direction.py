@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from math import atan2, copysign, cos, degrees, hypot, sin
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +10,7 @@ from magshell_fenicsx.continuation.device import Curve
 from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
-from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
-
-if TYPE_CHECKING:
-    from magshell_fenicsx.continuation.system import State
-    from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
 FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
@@ -64,17 +58,6 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
 def as_a_whole(name: str, total: float) -> dict[str, Curve]:
     """The amplitude of the rotation of a field in space, which is 1 at the angle `total` (rad)."""
     return {name: lambda t: (t / total, 1 / total, 0.0)}
-
-
-class FieldSeen(Seen):
-    """How strong the field is and how far it has turned, columns of every run."""
-
-    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        return ()
-
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        angle = field_angle(state.mu, sight.loads.magnetic, sight.sense)
-        return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:

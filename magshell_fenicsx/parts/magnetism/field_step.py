@@ -13,7 +13,8 @@ from magshell_fenicsx.input.section import Direction, in_units
 from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:

@@ -10,8 +10,9 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.sections import MeshSurface
 

@@ -24,9 +24,10 @@ from magshell_fenicsx.models.shell.patterns import (
 )
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sensors import sensors, units
 from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values

@@ -38,6 +38,22 @@ register(
 )
 
 
+class FieldSeen(Seen):
+    """How strong the field is and how far it has turned, columns of every run."""
+
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        return ()
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+        from magshell_fenicsx.parts.magnetism.direction import (  # the solver takes long to import
+            field_angle,
+            field_size,
+        )
+
+        angle = field_angle(state.mu, sight.loads.magnetic, sight.sense)
+        return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
+
+
 class SoftSeen(Seen):
     """The mean polarisation that the field induces."""
 

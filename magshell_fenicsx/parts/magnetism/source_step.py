@@ -12,8 +12,9 @@ from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, TURN, WAY, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 

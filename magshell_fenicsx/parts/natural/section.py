@@ -11,8 +11,9 @@ from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, Section, in_uni
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled, Offer
+from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry import Leaves
 

@@ -11,8 +11,9 @@ from magshell_fenicsx.input.section import over
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.course import Course, Fit, GasSection, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Account, Context, Modelled
+from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolved import CapSurface
 from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface

@@ -12,7 +12,8 @@ from magshell_fenicsx.input.section import Finite, Lengths, Name, Section, or_nu
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
+from magshell_fenicsx.parts.path_step import Count, PathStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 from magshell_fenicsx.shape.symmetry import Leaves

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.connected import CellsOfAll, whole
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
-from magshell_fenicsx.parts.touching.section import WHOLE
-from magshell_fenicsx.parts.touching.touching import Pair, Points, Touching
+from magshell_fenicsx.parts.touching.section import WHOLE, Pair
+from magshell_fenicsx.parts.touching.touching import Points, Touching
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]

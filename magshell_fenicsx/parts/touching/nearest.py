@@ -265,3 +265,38 @@ def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs
             found.append((i[fits], j[fits]))
     i, j = (np.concatenate(each).astype(np.int64) for each in zip(*found, strict=True))
     return i, j
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Places of a point on one side, in neighbouring cells, as one: a fold between cells has no jump then.
+
+    Attributes
+    ----------
+    first
+        (m,) the nearest place of each.
+    group
+        (n,) the joined one that a place belongs to.
+    distance
+        (m,) -e log sum exp(-d/e) of the distances d of its places, with a small e.
+    weight
+        (n,) its derivatives by these.
+    several
+        (m,) whether it has several places.
+    """
+
+    first: Longs
+    group: Longs
+    distance: Array
+    weight: Array
+    several: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, at: Places, blur: float) -> "Joined":
+        """Of places in the order of points, sides and distances."""
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        counts = np.diff([*first, len(at.point)])
+        group = np.repeat(np.arange(len(first)), counts)
+        size = np.exp((at.distance[first][group] - at.distance) / blur)
+        total = np.bincount(group, size, len(first))
+        return cls(first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1)

@@ -1,6 +1,7 @@
 """The key `contact`: which shells may touch, and what a case with it can be."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
@@ -13,7 +14,6 @@ from magshell_fenicsx.shape.symmetry import Leaves, nothing
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
-    from magshell_fenicsx.parts.touching.touching import Pair
     from magshell_fenicsx.shape.outline import Outline
 
 WHOLE = "shell"
@@ -22,6 +22,41 @@ Pairs = Annotated[
     list[Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]],
     Field(max_length=20),
 ]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What may touch, dimensionless.
+
+    Attributes
+    ----------
+    names
+        Of both: `shell`, or a patch.
+    suffix
+        What its columns have at their ends.
+    stiffness
+        k of the penalty, over E h/R^2.
+    bound
+        Largest penetration that is allowed, over h.
+    thickness
+        The mean of both thicknesses over h.
+    """
+
+    names: tuple[str, str]
+    suffix: str
+    stiffness: float
+    bound: float = 1e-3
+    thickness: float = 1.0
+
+    @property
+    def setting(self) -> str:
+        """Name of its stiffness in a state; no name of a user has a space."""
+        return f"stiffness between {self.names[0]} and {self.names[1]}"
+
+    @property
+    def words(self) -> str:
+        """What it is, in messages."""
+        return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
 
 
 class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
@@ -41,7 +76,7 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.thicknesses if several else {})}
 
 
-def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, float | None]) -> "tuple[Pair, ...]":
+def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, float | None]) -> tuple[Pair, ...]:
     """What a case's pairs are in a model.
 
     Parameters
@@ -54,8 +89,6 @@ def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, flo
     CaseError
         If the faces of a pair are not one distance from their mid-surfaces.
     """
-    from magshell_fenicsx.parts.touching.touching import Pair  # the solver takes long to import
-
     k = STIFF / (12 * (1 - nu**2))
     several = len(given) > 1
     return tuple(

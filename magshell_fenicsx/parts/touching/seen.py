@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.parts.touching.touching import Pair
+    from magshell_fenicsx.parts.touching.section import Pair
 
 
 class TouchingSeen(Seen):

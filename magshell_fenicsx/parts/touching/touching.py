@@ -26,6 +26,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BULGE,
     Cells,
+    Joined,
     Longs,
     Places,
     inverse,
@@ -34,6 +35,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     slopes,
 )
 from magshell_fenicsx.parts.touching.nearest import project as projected
+from magshell_fenicsx.parts.touching.section import Pair
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
@@ -45,41 +47,6 @@ BLUR = 1e-6  # of the thickness: distances that differ by less belong to one pla
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
-
-
-@dataclass(frozen=True)
-class Pair:
-    """What may touch, dimensionless.
-
-    Attributes
-    ----------
-    names
-        Of both: `shell`, or a patch.
-    suffix
-        What its columns have at their ends.
-    stiffness
-        k of the penalty, over E h/R^2.
-    bound
-        Largest penetration that is allowed, over h.
-    thickness
-        The mean of both thicknesses over h.
-    """
-
-    names: tuple[str, str]
-    suffix: str
-    stiffness: float
-    bound: float = 1e-3
-    thickness: float = 1.0
-
-    @property
-    def setting(self) -> str:
-        """Name of its stiffness in a state; no name of a user has a space."""
-        return f"stiffness between {self.names[0]} and {self.names[1]}"
-
-    @property
-    def words(self) -> str:
-        """What it is, in messages."""
-        return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
 
 
 @dataclass
@@ -287,7 +254,7 @@ class Touching:
         points = self._points
         return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
 
-    def _pressed(self) -> tuple[Places, "Joined", tuple[Array, Array, Array]]:
+    def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
         u = self._now()
@@ -297,7 +264,7 @@ class Touching:
         joined = self._joined
         return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
 
-    def _between(self, at: Places, joined: "Joined", first: Array, second: Array) -> Entries:
+    def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
         """What the Hessian of joined places has besides those of each."""
         some = joined.several[joined.group]
         part, group = at.of(some), joined.group[some]
@@ -455,38 +422,3 @@ class Touching:
 def _none() -> Places:
     nothing = np.zeros(0, dtype=np.int64)
     return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
-
-
-@dataclass(frozen=True)
-class Joined:
-    """Places of a point on one side, in neighbouring cells, as one: a fold between cells has no jump then.
-
-    Attributes
-    ----------
-    first
-        (m,) the nearest place of each.
-    group
-        (n,) the joined one that a place belongs to.
-    distance
-        (m,) -e log sum exp(-d/e) of the distances d of its places, with a small e.
-    weight
-        (n,) its derivatives by these.
-    several
-        (m,) whether it has several places.
-    """
-
-    first: Longs
-    group: Longs
-    distance: Array
-    weight: Array
-    several: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, at: Places, blur: float) -> "Joined":
-        """Of places in the order of points, sides and distances."""
-        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
-        counts = np.diff([*first, len(at.point)])
-        group = np.repeat(np.arange(len(first)), counts)
-        size = np.exp((at.distance[first][group] - at.distance) / blur)
-        total = np.bincount(group, size, len(first))
-        return cls(first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1)

@@ -10,8 +10,8 @@ from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRi
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.fields import Layer, layer_average
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.magnetism.remanent import Layer, layer_average
 from magshell_fenicsx.shells.shell import ShellModel
 
 UP = np.array([0.0, 0, 1])

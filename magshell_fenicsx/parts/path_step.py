@@ -1,0 +1,206 @@
+"""The base of the steps that follow a path: their controls, targets, and what comes after an instability."""
+
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import is_over_unit, over_unit
+from magshell_fenicsx.parts.course import (
+    Control,
+    Course,
+    Drive,
+    Here,
+    Now,
+    Prescribed,
+    SnapSection,
+    Target,
+    Until,
+)
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.step import LEAST_TARGET, Step
+
+if TYPE_CHECKING:
+    pass
+
+Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
+
+
+class PathStep(Step):
+    """What every load that is followed along a path has in common.
+
+    Attributes
+    ----------
+    targets
+        The keys of targets.
+    conjugate_control
+        Name of the control that prescribes the conjugate displacement.
+    """
+
+    targets: ClassVar[dict[str, Target]] = {}
+    conjugate_control: ClassVar[str] = "displacement"
+    control: str
+    until: Until
+    points: Count = 10
+    then: Literal["snap", "follow"] | None = None
+    """What follows the instability that ends the step. `snap`, with `until: limit` or `bifurcation`: the shell is
+    released, and moves under its loads and what else is held, lightly damped, until it rests on the branch that it
+    snaps to. `follow`, with `until: bifurcation`: the branch that begins there is followed, to a target that may stand
+    here, or for `points` steps. A mode that a meridian or a half excludes takes the smallest model that has it: for
+    m waves the sector of 180/m degrees between two mirror planes, else a half, else the whole shell. The next step
+    goes on from there, in that model"""
+    snap: SnapSection = SnapSection.model_construct()
+    """How it is released"""
+    branches: bool = False
+    """Follow the branch at the first bifurcation too, to the target or for `points` steps: both directions of one
+    that the model has itself; of a mode that it excludes one, in the smallest model that has it, and the other is the
+    same shape, turned or mirrored"""
+    sensitivities: bool = False
+    """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _control_of_the_target(cls, data: Any) -> Any:
+        """A target that is a load is reached by load control, where the default prescribes its conjugate."""
+        default = cls.model_fields["control"].default
+        if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
+            return data
+        quantities = {each.quantity for key, each in cls.targets.items() if data.get(key) is not None}
+        return {**data, "control": "load"} if quantities == {"load"} else data
+
+    @model_validator(mode="after")
+    def _target_fits_control(self) -> Self:
+        """One target that fits the control with `until: target`, none elsewhere."""
+        given, by = self._given, self.prescribed
+        fitting = [key for key, (quantity, _) in self.targets.items() if by in ("arc", quantity)]
+        for key, value in given.items():
+            if 0 < abs(value) < LEAST_TARGET:
+                raise ValueError(f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size")
+        if self.until == "target" and (len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)):
+            names = " or ".join(fitting) or "another control"
+            raise ValueError(
+                f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
+                f"takes {' or '.join(self.targets)}"
+            )
+        onward = self.until == "bifurcation" and self.then == "follow"
+        if onward and len(given) > 1:
+            raise ValueError(f"{' and '.join(given)}: a branch has one target")
+        if self.until in ("limit", "bifurcation", "zero") and given and not onward:
+            raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
+        if self.until in ("points", "zero") and by != "arc":
+            why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
+            raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
+        if self.then == "snap" and self.until not in ("limit", "bifurcation"):
+            raise ValueError("then: snap: goes with until: limit or until: bifurcation")
+        if self.then == "follow" and self.until != "bifurcation":
+            raise ValueError("then: follow: goes with until: bifurcation")
+        if self.snap != SnapSection() and self.then != "snap":
+            raise ValueError("snap: goes with then: snap")
+        return self
+
+    @classmethod
+    def level(cls, text: str, context: Context) -> float:
+        for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
+            annotation = cls.model_fields[key].annotation
+            if is_over_unit(annotation):
+                return over_unit(annotation, text, context.shell)
+        return super().level(text, context)
+
+    @property
+    def ends(self) -> Until:
+        return self.until
+
+    @property
+    def released_by(self) -> SnapSection | None:
+        return self.snap if self.then == "snap" else None
+
+    @property
+    def follows_branch(self) -> bool:
+        return self.then == "follow"
+
+    @property
+    def _given(self) -> dict[str, float]:
+        return {key: value for key in self.targets if (value := getattr(self, key)) is not None}
+
+    @property
+    def _end(self) -> float | None:
+        """The target if no key gives one."""
+        return None
+
+    @property
+    def prescribed(self) -> Control:
+        """What is prescribed step by step, in the words of the solver."""
+        if self.control == self.conjugate_control:
+            return "conjugate"
+        return "load" if self.control == "load" else "arc"
+
+    @property
+    def target(self) -> tuple[Target, float] | None:
+        for key, value in self._given.items():
+            return self.targets[key], value
+        if self._end is None or self.until != "target":
+            return None
+        return next(iter(self.targets.values())), self._end
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        """Change of the amplitude in the first step, by default one of equal parts; its sign is that of `change`.
+
+        Parameters
+        ----------
+        change
+            From here to the target; without one 1.
+        by_load
+            Whether it is a change of the amplitude.
+        """
+        return change / self.points
+
+    def step(self, change: float | None, now: Now) -> float | None:
+        """The first step of a prescribed conjugate; None: it follows from `first`."""
+        return None
+
+    def drive(self, now: Now) -> Drive:
+        """How the step drives its amplitude from here.
+
+        Targets are equal parts of the way: from zero if the amplitude is driven for the first time, without those
+        that earlier steps have passed.
+        """
+        goal = self.target
+        quantity: Prescribed = goal[0].quantity if goal else "load"
+        by_load = quantity == "load"
+        here = now.value if by_load else now.conjugate
+        end = None if goal is None else goal[1] * (now.size if by_load else now.unit)
+        change = now.size if end is None else end - here
+        found: list[float] = []
+        if end is not None and self.until == "target":
+            begin = here if now.driven else self.begin(here)
+            found = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
+            found = [t for t in found if (t - here) * change > 0]
+        if self.until == "zero":
+            found = [0.0]
+        first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
+        return Drive(self.prescribed, quantity, end, found, first, self.scale(now), step)
+
+    def course(self, here: Here) -> Course:
+        until = "target" if self.until == "zero" else self.until
+        steps = self.points if until == "points" else None
+        return Course(self.drive(here.now()), until, steps, self.curves(here))
+
+    @property
+    def branch_points(self) -> int:
+        return self.points if self.branches else 0
+
+    @property
+    def wants_sensitivities(self) -> bool:
+        return self.sensitivities
+
+    def by_conjugate(self, *, at_target: bool) -> bool:
+        goal = self.target if at_target and self.until == "target" else None
+        return self.control == self.conjugate_control or (goal is not None and goal[0].quantity == "conjugate")
+
+    def begin(self, here: float) -> float:
+        """Where the equal parts of the first way to a target begin."""
+        return 0.0
+
+    def scale(self, now: Now) -> float:
+        """An amplitude that counts as of order one in the arc length."""
+        return 1.0
