@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.input.section import si_size
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.shell.patterns import ByControls, Controls
+from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]

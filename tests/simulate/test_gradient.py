@@ -14,7 +14,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
-from magshell_fenicsx.models.shell.patterns import ByControls
+from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow

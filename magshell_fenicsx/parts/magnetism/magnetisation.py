@@ -11,10 +11,9 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.patterns import (
-    ByControls,
     Components,
-    Controls,
     Inside,
     Pattern,
     Placed,

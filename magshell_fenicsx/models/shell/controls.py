@@ -1,0 +1,83 @@
+"""Control points: a field as a mean of their values, without a mesh, as designs vary it and measured points give it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+LEAST = 1e-10  # weights below it, relative to the largest, are left out
+FEW = 32  # points that are looked at first
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Control points, over R: each place has the mean of their values, weighted by distance.
+
+        B(x) = sum_i w_i(x) B_i,    w_i ~ exp(-|x - x_i|^2/l^2),    sum_i w_i = 1
+
+    The width l is the filter length of a design: nothing varies over less. B is linear in the values, it has no mesh,
+    and as a mean it is nowhere longer than the longest of them.
+
+    Attributes
+    ----------
+    places
+        (n, 3); or (n, 2) of rho and z, of a field that turns with the azimuth about e3.
+    width
+        l.
+    """
+
+    places: Array
+    width: float
+
+    @property
+    def around(self) -> bool:
+        """Whether the field turns about e3."""
+        return self.places.shape[1] == 2
+
+    def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
+        """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
+        at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.around else x
+        tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
+        looked = min(FEW, count)
+        while True:
+            distance, number = (v.reshape(len(at), looked) for v in tree.query(at, looked))
+            w = np.exp((distance[:, :1] ** 2 - distance**2) / self.width**2)
+            if looked == count or w[:, -1].max(initial=0.0) < LEAST:
+                break
+            looked = min(2 * looked, count)
+        w /= w.sum(axis=1, keepdims=True)
+        rows = np.repeat(np.arange(len(at)), looked)
+        return scipy.sparse.csr_matrix((w.ravel(), (rows, number.ravel())), shape=(len(at), count))
+
+
+@dataclass(frozen=True)
+class ByControls:
+    """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those that turn.
+
+    `frame` is as of `patterns.Components`.
+    """
+
+    controls: Controls
+    values: Array
+    frame: Array | None = None
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        x = np.asarray(r0.reshape(-1, 3))
+        x = x if self.frame is None else x @ self.frame
+        found: Array = np.asarray(self.controls.weights(x) @ self.values)
+        if self.controls.around:
+            rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
+            found = np.column_stack([found[:, :1] * x[:, :2] / rho, found[:, 1]])
+        return np.asarray(found if self.frame is None else found @ self.frame.T).reshape(r0.shape)
+
+    def pulled(self, r0: Array, forces: Array) -> Array:
+        """The transposed map: what multiplies each of the values in sum(forces . B) over places (cells, nodes, 3)."""
+        x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
+        if self.frame is not None:
+            x, f = x @ self.frame, f @ self.frame
+        if self.controls.around:
+            rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
+            f = np.column_stack([np.sum(f[:, :2] * x[:, :2] / rho, axis=1), f[:, 2]])
+        return np.asarray(self.controls.weights(x).T @ f)
