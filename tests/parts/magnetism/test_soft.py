@@ -91,7 +91,10 @@ def rough(kind: str) -> tuple[Any, np.ndarray, dict[str, float]]:
     return system, u, {name: 0.3 + 0.1 * i for i, name in enumerate(sorted(mu))}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+SLOW = "solid, saturating"  # its kernels take two minutes to compile
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k == SLOW else k for k in KINDS])
 def test_derivatives(kind: str) -> None:
     """Residual, tangent, load columns, conjugates and their derivatives by all amplitudes, by central differences."""
     system, u, mu = rough(kind)
