@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf, radians, sqrt
-from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -283,10 +283,25 @@ def _refuse_steep(depth: float, slope: float) -> None:
         raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
 
 
+@dataclass(frozen=True)
 class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
-    """All imperfections of a case, by their keys below `shell`."""
+    """All imperfections of a case, by their keys below `shell`.
+
+    Attributes
+    ----------
+    written
+        The sections that stand there, by key; one may be several imperfections.
+    """
 
     key = "imperfections"
+    written: Mapping[str, ImperfectionSection]
+
+    @classmethod
+    def of(cls, context: Context) -> Self | None:
+        given, shell = context.sections.get(cls.key), context.shell
+        written = {f"imperfections.{i}": section for i, section in enumerate(shell.imperfections)}
+        defect = getattr(shell, "defect", None)
+        return cls(given, written | ({"defect": defect} if defect else {})) if given else None
 
     def refuse_unfit(self, context: Context) -> None:
         """See that the shell can have them."""
@@ -301,10 +316,10 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 raise ValueError(f"shell.{key}: {e}") from None
 
     def lengths(self, data: Mapping[str, Any]) -> Iterator[str]:
-        written = {f"imperfections.{i}": item for i, item in enumerate(data["shell"].get("imperfections") or [])}
-        written |= {"defect": item} if (item := data["shell"].get("defect")) else {}
-        for key, item in written.items():
-            yield from lengths_with_units(type(self.given[key]), item, f"shell.{key}.")
+        items = {f"imperfections.{i}": item for i, item in enumerate(data["shell"].get("imperfections") or [])}
+        items |= {"defect": item} if (item := data["shell"].get("defect")) else {}
+        for key, item in items.items():
+            yield from lengths_with_units(type(self.written[key]), item, f"shell.{key}.")
 
 
 def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:
