@@ -201,12 +201,12 @@ class History:
     `last` the last one that is no instability, `end` the last one of all, `first` the first one.
     """
 
-    first: Record | None = None
     last: Record | None = None
     end: Record | None = None
     begin: Record | None = None
     located: list[Record] = field(default_factory=list)
     begins: dict[int, Record] = field(default_factory=dict)
+    first: Record | None = None
 
     def add(self, record: Record) -> None:
         if record.branch:
