@@ -309,7 +309,8 @@ def Problem(
 def _refuse_unfit_shells(several: Sequence[Any]) -> None:
     for each in several:
         if not isinstance(each, Shell) or not each.name:
-            raise CaseError(f"{NAME}: {each!r}: of several shells each is what ms.Shell gives, with a name")
+            told = "a shell without a name" if isinstance(each, Shell) else repr(each)
+            raise CaseError(f"{NAME}: {told}: of several shells each is what ms.Shell gives, with a name")
         if each.home:
             raise CaseError(f"{NAME}: {each.name}: of several shells each has a geometry: write its mesh to a file")
     names = [each.name for each in several]

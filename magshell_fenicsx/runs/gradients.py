@@ -68,6 +68,7 @@ def gradients_after(result: Result, folder: Path, say: Say) -> None:
             continue
         fields = {by: each for by, each in slopes.items() if isinstance(each, FieldGradient)}
         numbers = {by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)}
+        scene = found.scene  # that of the end, which may be of another model
         told: dict[str, dict[str, Any]] = {by: {"alike": _alike(scene, by, each)} for by, each in fields.items()}
         if fields:
             drawn = _surface(scene, found, fields)

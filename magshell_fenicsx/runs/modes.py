@@ -29,7 +29,8 @@ from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.problem.wanted import FrequenciesSection, StabilitySection
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
-from magshell_fenicsx.shells.modes import ShellMode, ShellModes
+from magshell_fenicsx.shells.mass import Model
+from magshell_fenicsx.shells.modes import Seen, ShellMode, ShellModes, seen_on
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.touch import hardened, pressing, rigid
 
@@ -62,6 +63,15 @@ class _Writer:
     folder: Path
     say: Say
     _known: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
+    _seen: dict[int, tuple[Seen, ShellModes, Gatherer]] = field(default_factory=dict)
+
+    def _all_of(self, number: int) -> tuple[Seen, ShellModes, Gatherer]:
+        """The same of the model that sees all modes of the shell."""
+        scene = self.result.scene_of(number)
+        if id(scene) not in self._seen:
+            on = seen_on(scene.model)
+            self._seen[id(scene)] = on, ShellModes(on.model), gatherer(on.model, scene.comm)
+        return self._seen[id(scene)]
 
     def _of(self, number: int) -> tuple[ShellModes, Gatherer]:
         """The modes of the model of a point, and what gathers them."""
@@ -93,8 +103,9 @@ class _Writer:
             points = {self.result.end: self.result.last}
         by_point: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
+            on, shell, _ = self._all_of(number)
             try:
-                lowest = self._of(number)[0].lowest(state, wanted.modes)
+                lowest = shell.lowest(on.state(state), wanted.modes)
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
                 by_point[number] = lowest[: max(wanted.modes, unstable)]
             except ModesNotFound as e:
@@ -102,7 +113,10 @@ class _Writer:
         by_first(self.result.scene.comm, partial(write_whole, self.folder / "stability.csv", mode_table(by_point)))
         for number, modes in by_point.items():
             for n, mode in enumerate(modes[: wanted.modes], 1):
-                self._write(number, str(n), points[number], mode.label, mode.vector)
+                file = mode_file(self.folder, number, str(n), mode.label)
+                on, _, gathering = self._all_of(number)
+                state, scene = on.state(points[number]), self.result.scene_of(number)
+                write_mode_of(scene, gathering, file, state, mode.label, mode.vector, on)
             first = modes[0]
             self.say(f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip())
 
@@ -112,10 +126,11 @@ class _Writer:
 
 
 def write_mode_of(
-    scene: Scene, gatherer: Gatherer, file: Path, state: State, label: str, vector: Vector
+    scene: Scene, gatherer: Gatherer, file: Path, state: State, label: str, vector: Vector, on: Seen | None = None
 ) -> Surface | None:
-    """Write a mode at a state, and return it on rank 0; collective."""
-    surface = mode_surface(scene.model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
+    """Write a mode at a state, both of the model where it is seen, and return it on rank 0; collective."""
+    model = on.model if on else scene.model
+    surface = mode_surface(model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
 
     def write() -> None:
         assert surface is not None
@@ -131,11 +146,11 @@ def wanted(section: FrequenciesSection | None, point: int) -> bool:
     return at == "all" or (isinstance(at, list) and point in at)
 
 
-def own_wave(scene: Scene) -> str:
+def own_wave(model: Model) -> str:
     """The wave of the model's own modes."""
-    if scene.model.axisymmetric:
+    if model.axisymmetric:
         return "0"
-    return "symmetric" if scene.model.multiplicity > 1 else ""
+    return "symmetric" if model.multiplicity > 1 else ""
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
@@ -150,7 +165,8 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     harder = hardened(scene, state, bodies)
     if harder is None:
         return [nan] * len(modes)
-    others = ShellModes(scene.model).vibrations(harder, len(modes) + 2)
+    on = seen_on(scene.model)
+    others = ShellModes(on.model).vibrations(on.state(harder), len(modes) + 2)
     return [
         min((abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label), default=1.0)
         for mode in modes
@@ -187,13 +203,18 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         states = {**start, result.end: result.last}
     elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
         say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
-    own, unit, of = own_wave(scene), scene.problem.time_unit, dict[int, ShellModes]()
+    own, unit = dict[int, str](), scene.problem.time_unit
+    of, seen = dict[int, tuple[Seen, ShellModes]](), dict[int, Seen]()
     for number, state in states.items():
         scene = result.scene_of(number)
-        shell = of.setdefault(id(scene), ShellModes(scene.model))
+        if id(scene) not in of:
+            on = seen_on(scene.model)
+            of[id(scene)] = on, ShellModes(on.model)
+        on, shell = of[id(scene)]
+        seen[number], own[number] = on, own_wave(on.model)
         state = rigid(scene, state)
         try:
-            result.frequencies[number] = modes = shell.vibrations(state, section.count)
+            result.frequencies[number] = modes = shell.vibrations(on.state(state), section.count)
             if scene.model.contacts:
                 result.contact_changes[number] = changes = contact_changes(scene, state, modes)
                 for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
@@ -203,14 +224,15 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
         first = modes[0]
-        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own)
+        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own[number])
         in_hertz = "" if f is None else f", {f:.6g} Hz"
         say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
         scene = result.scene_of(number)
-        gathering = gatherer(scene.model, scene.comm)
+        on = seen[number]
+        gathering, state = gatherer(on.model, scene.comm), on.state(states[number])
         for n, mode in enumerate(result.frequencies[number][: section.count], 1):
             file = mode_file(folder, number, f"f{n}", mode.label)
-            write_mode_of(scene, gathering, file, states[number], mode.label, mode.vector)
+            write_mode_of(scene, gathering, file, state, mode.label, mode.vector, on)

@@ -51,6 +51,10 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # mpirun passes SIGUS
 __all__ = ["Result", "run"]
 
 Say = Callable[[str], None]
+OF_THE_FIRST = (
+    "mesh.tolerance and the estimated error are of the bifurcation in the first model, and not of what follows in the "
+    "larger one"
+)
 ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
 
 
@@ -208,6 +212,8 @@ def _run(
         scene.journal = Stoppable(NoJournal(), watch)
         try:
             _follow(result, files, say, progress, start, watch)
+            if chosen and result.walked.handed_over:
+                result.remarks.append(OF_THE_FIRST)
             for step in scene.problem.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")

@@ -22,9 +22,34 @@ from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetr
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, thickness
 from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The model in whose space all modes of a shell are, with those that it excludes: of a sector its half.
+
+    Attributes
+    ----------
+    of
+        A displacement of the given model in this one; collective.
+    """
+
+    model: Model
+    of: Callable[[Vector], Vector] = lambda u: u
+
+    def state(self, state: State) -> State:
+        """A state of the given model in this one; collective."""
+        return State(self.of(state.u), dict(state.mu))
+
+
+def seen_on(model: Model) -> Seen:
+    """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked; collective."""
+    modes = None if isinstance(model, MeridianModel) else model.excluded_modes
+    return Seen(modes.half, modes.unfolded) if isinstance(modes, UnfoldedModes) else Seen(model)
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,11 @@ def departure_of(scene: Scene, step: ProgrammeStep, found: Record) -> Departure:
     return departed(stage_of(scene, step, found.point.state), found, scale)
 
 
+def leaves_path(step: ProgrammeStep) -> bool:
+    """Whether what follows the bifurcation that ends a step is not on the path: a branch, or a snap."""
+    return step.until == "bifurcation" and (step.load.follows_branch or step.load.released_by is not None)
+
+
 def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
     return step.load.course(_here(scene, step, state)).drive
 

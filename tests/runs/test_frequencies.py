@@ -263,3 +263,23 @@ def test_frequencies_under_a_plate_are_those_of_a_rigid_one(tmp_path: Path) -> N
             assert {wave: value for wave, value, _ in found} == pytest.approx(half, rel=3e-3)
             assert not soft
             assert "depends on the stiffness" not in done.stdout
+
+
+def test_a_sector_has_the_frequencies_of_the_whole_shell(tmp_path: Path) -> None:
+    """A cap of m = 3 under half of its load: waves that the sector of 36 degrees excludes come first (meridian)."""
+    text = (
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "mesh: {degree: 3, refinement: 0.7}\nfrequencies: {count: 8, at: end}\nstability: {at: end}\n"
+        "loading: {kind: pressure, control: load, until: target, pressure: 0.46, points: 1}\nsymmetry: %s\n"
+    )
+    found = {}
+    for symmetry in ("5", "axisymmetric"):
+        (tmp_path / "case.yaml").write_text(text % symmetry)
+        out = tmp_path / symmetry
+        assert magshell("run", tmp_path / "case.yaml", "--out", out, "--no-pictures").returncode == 0
+        tables = [list(csv.DictReader((out / name).open())) for name in ("frequencies.csv", "stability.csv")]
+        found[symmetry] = [float(row["omega2"]) for row in tables[0]], float(tables[1][0]["eigenvalue"])
+    waves = found["axisymmetric"]
+    assert found["5"][1] == pytest.approx(waves[1], rel=3e-3)
+    assert found["5"][0][0:8:2][:3] == pytest.approx(waves[0][:3], rel=5e-3)  # each wave and its twin
+    assert found["5"][0][1:8:2][:3] == pytest.approx(waves[0][:3], rel=5e-3)

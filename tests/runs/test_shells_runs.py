@@ -8,6 +8,8 @@ from command import all_started, magshell, read_path
 from conftest import CASES
 from interrupted import kill, start, wait_for_rows
 
+import magshell_fenicsx as ms
+
 SHORT = ["--set=loading.displacement=0.02", "--set=loading.points=2", "--no-pictures"]
 EXACT = ("w_over_h", "left_crease_uz", "load_factor", "energy")
 
@@ -43,3 +45,22 @@ def test_resume(tmp_path: Path) -> None:
     whole, again = (read_path(tmp_path / name) for name in ("whole", "killed"))
     for column in ("label", *EXACT):
         assert [row[column] for row in again] == [row[column] for row in whole]
+
+
+def test_two_shells_from_python() -> None:
+    """Caps apart, one upside down and thicker, under one pressure: each moves as a cap alone does."""
+    keys = {"radius": "25 mm", "polar": 25, "youngs_modulus": "1.8 MPa", "poisson_ratio": 0.3}
+    mesh = ms.Section("mesh", degree=2, size="8 mm")
+    load = {"control": "load", "until": "target", "pressure": "20 Pa", "points": 1}
+    thick = {"lower": "0.5 mm", "upper": "0.8 mm"}
+    lower = ms.Shell("cap", name="lower", thickness=thick["lower"], **keys)
+    place = {"position": [0, 0, "60 mm"], "axis": {"polar": 180}}
+    upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, **keys)
+    points = {"lower.tip": [0, 0, "25 mm"], "upper.tip": [0, 0, "25 mm"]}
+    clamped = ms.Clamped("lower.rim", "upper.rim")
+    both = ms.run(ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points)).rows[-1]
+    for name, sign in (("lower", 1), ("upper", -1)):
+        alone = ms.Shell("cap", thickness=thick[name], **keys)
+        parts = (ms.Clamped("rim"), ms.Pressure(**load), mesh)
+        row = ms.run(ms.Problem(alone, *parts, points={"tip": [0, 0, "25 mm"]}, symmetry="none")).rows[-1]
+        assert both[f"{name}_tip_uz"] == pytest.approx(sign * row["tip_uz"], rel=1e-6)

@@ -1,8 +1,10 @@
 """Branches of modes that a reduced model excludes, in the smallest model that has them."""
 
+import json
 from itertools import pairwise
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from command import magshell, read_path
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenConjugate
-from magshell_fenicsx.continuation.modes import critical_mode
+from magshell_fenicsx.continuation.modes import critical_mode, nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Sector, rotation
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
@@ -91,8 +93,8 @@ def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     for column in ("energy", "volume_change", "w_pole_over_h"):
         assert two[column] == pytest.approx(one[column], rel=3e-4)
     waves = old.scene.model.excluded_modes.waves
-    stiff = abs(waves.critical_eigenvalue(records[1].point.state, 5))
-    assert abs(waves.critical_eigenvalue(old.point.state, 5)) < 1e-6 * stiff
+    stiff = abs(nearest_to_zero(waves.factor_at(records[1].point.state, 5))[0])
+    assert abs(nearest_to_zero(waves.factor_at(old.point.state, 5))[0]) < 1e-6 * stiff
     lowest = ShellModes(new.scene.model).lowest(new.point.state, 2)
     assert abs(lowest[0].eigenvalue) < 1e-6 * lowest[1].eigenvalue
 
@@ -174,3 +176,38 @@ def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: P
             )
             for column in ("p_over_pc", "w_over_h", "energy"):
                 assert float(row[column]) == pytest.approx(float(there[column]), rel=1e-5, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
+    """Gradients of the instability are of the first model, those at the end of the last; differences of runs agree.
+
+    mesh.tolerance is of the bifurcation, and the run says so.
+    """
+    target = "{kind: pressure, control: load, until: target, pressure: 0.505, points: 1}"
+    text = (
+        "shell: {geometry: cap, radius: 1, thickness: %r, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "loading: [{kind: pressure, until: bifurcation, then: follow, points: 6}, %s]\n"
+    )
+    coarse = "mesh={degree: 3, refinement: 0.7}"
+    asked = "gradients={of: [knockdown, volume_change], by: [shell.thickness]}"
+    found = dict[float, Any]()
+    for h in (0.00999, 0.01001, 0.01):
+        case = tmp_path / f"{h}.yaml"
+        case.write_text(text % (h, target))
+        more = ["--set", asked] if h == 0.01 else []
+        out = tmp_path / f"{h}"
+        assert magshell("run", case, "--set", coarse, *more, "--out", out, "--no-pictures").returncode == 0
+        last = float(read_path(out)[-1]["volume_change"])
+        found[h] = json.loads((out / "summary.json").read_text()) | {"volume_change": last}
+    slopes = found[0.01]["gradients"]
+    assert slopes["knockdown"]["value"] == pytest.approx(found[0.01]["knockdown"], rel=1e-6)
+    for of in ("knockdown", "volume_change"):
+        by_difference = (found[0.01001][of] - found[0.00999][of]) / 2e-5
+        assert slopes[of]["numbers"]["shell.thickness"] == pytest.approx(by_difference, rel=2e-3)
+    out = tmp_path / "adapted"
+    adapted = magshell("run", case, "--set", "mesh.tolerance=0.05", "--out", out, "--no-pictures")
+    assert adapted.returncode == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["tolerance"]["error_estimate"] < 0.05
+    assert any("in the first model" in said for said in summary["remarks"])

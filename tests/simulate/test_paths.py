@@ -102,7 +102,7 @@ def test_target_beyond_the_fold_in_units() -> None:
 @pytest.mark.slow
 def test_indentation_through_its_fold_in_displacement() -> None:
     """Mixed reference (hybridised Hellan-Herrmann-Johnson): peak 2.10, 1.3149 at w/h = 5, w turns back at 5.9."""
-    found = result("indentation_snap_back.yaml", "mesh.refinement=0.75")
+    found = result("indentation_snap_back.yaml")
     assert found.stopped is None
     forces = [value for amplitude, kind, value in events(found) if kind == "fold"]
     assert forces[0] == pytest.approx(2.10, abs=0.01)

@@ -212,7 +212,7 @@ def test_samples_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edi
 def test_a_program_that_changes_under_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run of other sources than the study's is no sample."""
     faked(monkeypatch, sample)
-    measured = sample.Measured({})
+    measured = sample.Timings({})
     sample.complete(measured, ["case"], 1, 3, tmp_path / "kept.json", {"sources": OTHER})
     assert measured.failure == "the program or the mesh file was changed during the study"
     assert not measured.samples

@@ -246,15 +246,18 @@ def hertz(omega2: float, time_unit: float | None) -> float | None:
 
 def frequency_table(
     by_point: Mapping[int, Sequence[Mode]],
-    own: str,
+    own: Mapping[int, str],
     time_unit: float | None,
     contact_changes: Mapping[int, Sequence[float]],
 ) -> bytes:
-    """The file: modes of each point, ascending; `contact_changes` is a column where there are bodies."""
+    """The file: modes of each point, ascending; `own` is the wave of its model's own modes.
+
+    `contact_changes` is a column where there are bodies.
+    """
     lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
     for point, modes in by_point.items():
         for n, mode in enumerate(modes):
-            row = (point, wave_of(mode.label, own), mode.eigenvalue, hertz(mode.eigenvalue, time_unit))
+            row = (point, wave_of(mode.label, own[point]), mode.eigenvalue, hertz(mode.eigenvalue, time_unit))
             lines.append((*row, contact_changes[point][n]) if contact_changes else row)
     return table_text(lines, end="\n").encode()
 

@@ -19,6 +19,7 @@ from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import leaves_path
 from magshell_fenicsx.simulate.transfer import chart
 
 Array = NDArray[np.float64]
@@ -197,7 +198,7 @@ class History:
     """The records of a run that its end depends on.
 
     `begins` are the last ones before each step, `begin` that before the last one,
-    `last` the last one that is no instability, `end` the last one of all.
+    `last` the last one that is no instability, `end` the last one of all, `first` the first one.
     """
 
     last: Record | None = None
@@ -205,11 +206,12 @@ class History:
     begin: Record | None = None
     located: list[Record] = field(default_factory=list)
     begins: dict[int, Record] = field(default_factory=dict)
+    first: Record | None = None
 
     def add(self, record: Record) -> None:
         if record.branch:
             return
-        self.end = record
+        self.first, self.end = self.first or record, record
         if self.last and record.step != self.last.step:
             self.begins.setdefault(record.step, self.last)
         if record.label in ("fold", "bifurcation"):
@@ -222,6 +224,8 @@ class History:
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
         """The first instability; the last one with `until: bifurcation`; the last target with a target.
 
+        Of a run that goes on in another model, or along a branch, the bifurcation where it begins.
+
         Raises
         ------
         NoResult
@@ -229,6 +233,8 @@ class History:
         """
         steps = scene.problem.programme
         until = steps[-1].until if steps else "target"
+        if self.handed_over:  # beyond it meshes of the first model have no state to compare
+            return _instability(self._departures(scene)[0])
         if (
             until in ("target", "points", "zero")
             and not stopped
@@ -242,12 +248,26 @@ class History:
         if not self.located:
             raise NoResult(stopped or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]
-        end = in_last[-1 if until == "bifurcation" else 0]
-        if end.amplitude not in end.point.state.mu:
-            raise NoResult("an instability of a turning field is not a single load")
-        own_fold = end.label == "fold" and not end.mode
-        value = end.point.state.mu[end.amplitude]
-        return Ending("fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du)
+        departures = [record for record in self._departures(scene) if record.step == in_last[0].step]
+        return _instability(departures[0] if departures else in_last[-1 if until == "bifurcation" else 0])
+
+    @property
+    def handed_over(self) -> bool:
+        """Whether the last record is of another model than the first one."""
+        return bool(self.first and self.end) and self.end.scene is not self.first.scene  # type: ignore[union-attr]
+
+    def _departures(self, scene: Scene) -> list[Record]:
+        """The bifurcations of steps that leave the path there."""
+        steps = scene.problem.programme
+        return [r for r in self.located if r.label == "bifurcation" and leaves_path(steps[r.step - 1])]
+
+
+def _instability(end: Record) -> Ending:
+    if end.amplitude not in end.point.state.mu:
+        raise NoResult("an instability of a turning field is not a single load")
+    own_fold = end.label == "fold" and not end.mode
+    value = end.point.state.mu[end.amplitude]
+    return Ending("fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du)
 
 
 def by_path(scene: Scene) -> Ending:
@@ -262,6 +282,8 @@ def by_path(scene: Scene) -> Ending:
     try:
         for record in follow(scene, search=False, remark=lambda text: None):
             history.add(record)
+            if history.handed_over:
+                break
     except Stopped as e:
         stopped = str(e)
     return history.ending(scene, stopped)

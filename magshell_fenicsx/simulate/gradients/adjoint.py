@@ -300,6 +300,11 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                 raise CaseError(f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step")
             break
         begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
+        if begin.scene and begin.scene is not scene:
+            if held or loads:
+                names = ", ".join({*held, *loads})
+                raise CaseError(f"{names}: as they were before {step.key}, in another model: no gradient")
+            break
         before = system.placed(begin.point.state)
         held_before = held_at(scene, begin, before)
         if part and place:

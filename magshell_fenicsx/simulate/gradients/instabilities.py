@@ -9,6 +9,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, a
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import leaves_path
 
 FOLDS = {
     "knockdown": "pressure",
@@ -29,6 +30,16 @@ def located(records: Sequence[Record], amplitude: str) -> list[Record]:
     """Where the path loses its stability in an amplitude."""
     there = [r for r in records if r.amplitude == amplitude and not r.branch]
     return [r for r in there if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)]
+
+
+def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
+    """Those up to the first bifurcation at which a step leaves the path."""
+    found, steps = list[Record](), scene.problem.programme
+    for record in records:
+        found.append(record)
+        if record.label == "bifurcation" and record.step and leaves_path(steps[record.step - 1]):
+            break
+    return found
 
 
 def load(record: Record, amplitude: str) -> float:
@@ -93,7 +104,7 @@ def instabilities(
         If there is none, or the lowest one has no gradient.
     """
     amplitude = FOLDS[of]
-    there = sorted(located(records, amplitude), key=lambda r: load(r, amplitude))
+    there = sorted(located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude))
     found = list[tuple[str, Adjoint]]()
     for record in [r for r in there if load(r, amplitude) <= BESIDE * load(there[0], amplitude)][:most]:
         name = record.mode or record.label

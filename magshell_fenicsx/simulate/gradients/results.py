@@ -130,6 +130,7 @@ def adjoint_at_end(
         If there is no such result.
     """
     assert history.end
+    scene = history.end.scene or scene
     if of == BARRIER:
         return "", adjoint_of_barrier(scene, history.begin, history.end, history.begins)
     if isinstance(of, str) and NAMES.fullmatch(of):
@@ -148,6 +149,7 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
     if not NAMES.fullmatch(of):
         return None
     assert history.end
+    scene = history.end.scene or scene
     state = rigid(scene, scene.model.system.placed(history.end.point.state))
     return frequency(scene.problem, of, vibration(scene, state, of).value)
 

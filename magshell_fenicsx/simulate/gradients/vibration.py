@@ -25,7 +25,7 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes
+from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes, seen_on
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
     WAVE,
@@ -109,6 +109,8 @@ def vibrations(scene: Scene, state: State, of: str, *, beside: float = 1.0, most
     Lost
         If it cannot be computed.
     """
+    if seen_on(scene.model).model is not scene.model:
+        raise Lost(f"{of}: a sector has the modes of its own planes alone: take symmetry: half or none")
     number = int(of.partition("_")[2])
     count = number + most
     while True:
