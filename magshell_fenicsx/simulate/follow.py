@@ -24,7 +24,7 @@ BEYOND = "beyond the first instability the path stopped: "  # how the remark of 
 
 
 def warned(remark: str) -> None:
-    """Tell it as a warning."""
+    """Say it as a warning."""
     warnings.warn(remark, stacklevel=3)
 
 
@@ -109,6 +109,23 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
+
+
+def follow_alone(scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warned) -> Iterator[Record]:
+    """The history of a scene for what reads all of it in the scene itself; see `follow`.
+
+    Raises
+    ------
+    Stopped
+        Also where it would go on in another model.
+    """
+    for record in follow(scene, search=search, remark=remark):
+        if record.scene is not None and record.scene is not scene:
+            raise Stopped(
+                "here the path goes on in another model, in which nothing is read for this command: leave out then and "
+                "branches, or take symmetry: none"
+            )
+        yield record
 
 
 def _recorded(scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str) -> Record:

@@ -24,7 +24,7 @@ from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.follow import BEYOND, follow
+from magshell_fenicsx.simulate.follow import BEYOND, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
@@ -168,7 +168,7 @@ class Read:
         to_end = any(each.at is None for each in wanted)
         last = len(scene.problem.programme)
         try:
-            for record in follow(scene, search=False, remark=remarks.append):
+            for record in follow_alone(scene, remark=remarks.append):
                 self._history.add(record)
                 self._records.append(record)
                 if waiting and record.step == last:

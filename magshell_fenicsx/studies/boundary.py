@@ -32,7 +32,7 @@ from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.follow import follow_alone
 from magshell_fenicsx.simulate.numbers import BESIDE
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -308,7 +308,7 @@ def _begin(source: Source, span: Range, value: float, made: Made, journal: _Jour
     scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
     records, lost = list[Record](), None
     try:
-        records.extend(follow(scene, search=False, remark=say))
+        records.extend(follow_alone(scene, remark=say))
     except Stopped as e:  # what lies beyond an instability does not matter
         lost = e
     try:

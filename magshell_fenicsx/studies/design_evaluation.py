@@ -11,7 +11,7 @@ from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.follow import BEYOND, follow
+from magshell_fenicsx.simulate.follow import BEYOND, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
 from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.gradient import derivative
@@ -80,7 +80,7 @@ def evaluate(
         for result in results:
             if result != MASS and result not in targets:
                 refuse_no_result(scene, [result], named[result], more=[MASS])
-        for record in follow(scene, search=False, remark=remarks.append):
+        for record in follow_alone(scene, remark=remarks.append):
             records.append(record)
             history.add(record)
             if _enough(records, results):

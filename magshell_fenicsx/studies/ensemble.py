@@ -25,7 +25,7 @@ from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.rows import RowMaker
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
-from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.follow import follow_alone
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -239,7 +239,7 @@ def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
     """The fold from the first point of the path that leads to it, or the end of the path."""
     result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
-        for record in follow(scene, remark=result.remarks.append):
+        for record in follow_alone(scene, search=True, remark=result.remarks.append):
             result.rows.append(made.row(record, 0.0))
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue

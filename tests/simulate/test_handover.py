@@ -18,9 +18,9 @@ from magshell_fenicsx.mesh.mirror import Sector, rotation
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.shells.modes import ShellModes
-from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.follow import follow, follow_alone
 from magshell_fenicsx.simulate.handover import through
-from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -146,6 +146,9 @@ def test_a_half_hands_over_to_the_whole_shell() -> None:
     phi = critical_mode(new.scene.newton, new.point.state)
     assert abs(phi.eigenvalue) < 1e-9
     assert records[-1].point.state.mu["load"] < old.point.state.mu["load"]
+    alone = list[Record]()
+    with pytest.raises(Stopped, match="in which nothing is read for this command"):  # as `identify` follows it
+        alone.extend(follow_alone(old.scene, remark=lambda said: None))
 
 
 @pytest.mark.slow
