@@ -275,7 +275,7 @@ class MagneticSection(Section, Ability):
                 "knows no more of them"
             )
         patches = self.remanent.patches if self.remanent else None
-        if patches and "rest" not in patches and not isinstance(shell, MeshSurface):
+        if patches is not None and "rest" not in patches and not isinstance(shell, MeshSurface):
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime:
