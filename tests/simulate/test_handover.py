@@ -121,8 +121,9 @@ def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.Mo
 
     pressures = [record.point.state.mu["pressure"] for record in records]
     assert pressures[1] * unit == pytest.approx(3 * h**3 / 12, rel=1e-4)
-    for record, pressure in zip(records[3:], pressures[3:], strict=True):
-        assert (pressure / pressures[1] - 1) / bend(record) ** 2 == pytest.approx(27 / 32, rel=0.01)
+    squares = np.array([bend(record) ** 2 for record in records[3:]])
+    rises = np.diff(pressures[3:]) / pressures[1]  # along the branch: at its begin rounding hides 1e-5 of the pressure
+    assert rises / np.diff(squares) == pytest.approx(27 / 32, rel=0.01)
 
 
 def test_a_half_hands_over_to_the_whole_shell() -> None:
