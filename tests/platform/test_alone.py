@@ -13,6 +13,7 @@ PROGRAM = """
 import pathlib, sys
 from mpi4py import MPI
 mode, rank, *words = sys.argv[1:]
+import magshell_fenicsx.case.planner as planner  # on all ranks: PETSc begins on them together
 if MPI.COMM_WORLD.rank == int(rank):
     from magshell_fenicsx.platform import reading
     if mode == "unreadable":
@@ -24,7 +25,6 @@ if MPI.COMM_WORLD.rank == int(rank):
     if mode == "another":
         words += ["--set", "shell.poisson_ratio=0.31"]
     if mode == "alone":
-        import magshell_fenicsx.case.planner as planner
         from magshell_fenicsx.input.source import CaseError
         def make_problem(*arguments):
             raise CaseError("mesh: only here")
