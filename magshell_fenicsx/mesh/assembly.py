@@ -100,7 +100,7 @@ class Assembly:
     members
         Makes its shells, each rank the same; a `MeshError` or `CaseError` begins with the key of one that cannot be.
     joints
-        Names of edges of which the one is joined to the other.
+        Pairs of names of edges; the first is joined to the second.
     thicknesses
         Name of a shell -> its thickness over that of the first; None where it varies.
     home

@@ -278,7 +278,7 @@ class Problem:
         return patch
 
     def _triangulated(self, shape: Shape) -> PatchMesh:
-        """A shape by gmsh: a sector from one half of it, whose mesh then tells no crests of waves from troughs."""
+        """The mesh of a shape by gmsh; that of a sector is symmetric, so that crests and troughs of waves are alike."""
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
         middle = Mirror.upright(self.mirror.angle / 2)

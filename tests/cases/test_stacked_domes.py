@@ -1,4 +1,4 @@
-"""Two domes, of which the one pushes the other."""
+"""Two domes: the upper one pushes the lower one."""
 
 from typing import Any
 

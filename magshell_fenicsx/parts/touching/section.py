@@ -98,7 +98,7 @@ def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, flo
 
 
 def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
-    """The mean of both thicknesses over h; a patch has that of its shell."""
+    """The mean thickness of a pair over h; a patch is as thick as its shell."""
     found = list[float]()
     for name in pair if thickness else ():
         of = [t for shell, t in thickness.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
