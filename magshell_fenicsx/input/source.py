@@ -15,6 +15,7 @@ Location = tuple[str | int, ...]
 INSTEAD: dict[Location, str] = {
     ("shell", "imperfections"): "defect"
 }  # a key of a setting -> the key beside it that it takes the place of
+MERGE = "tag:yaml.org,2002:merge"  # of the key <<
 LARGEST, MOST_ENTRIES, DEEPEST = 1_000_000, 10_000, 20  # bytes, keys and items, levels: far beyond any case
 
 
@@ -23,7 +24,13 @@ class CaseError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2."""
+    """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2. A key is its text, also `on` and `no`."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != MERGE:
+                key.tag = "tag:yaml.org,2002:str"
+        return dict(super().construct_mapping(node, deep))
 
 
 _Loader.add_implicit_resolver(

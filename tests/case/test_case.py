@@ -8,7 +8,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import changed
-from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 
 GOOD = dedent("""\
@@ -35,6 +35,13 @@ def file(tmp_path: Path) -> Path:
 
 def test_numbers_with_exponents_are_numbers(file: Path) -> None:
     assert Case.load(file).lambda_m == 1e-3
+
+
+def test_words_that_yaml_reads_as_true_and_false_are_keys(file: Path) -> None:
+    """`on` and `no` are true and false in YAML 1.1, and 1 is a number: as names of things they are themselves."""
+    file.write_text("base: &base {until: target, 1: a}\nloading: {<<: *base, on: {no: off}}\n", encoding="utf-8")
+    read = read_source(file, ["loading.hold={y: load}"])
+    assert read.data["loading"] == {"until": "target", "1": "a", "on": {"no": False}, "hold": {"y": "load"}}
 
 
 def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
