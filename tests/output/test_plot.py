@@ -2,6 +2,7 @@
 
 import io
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +170,16 @@ def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
     said = r"copy: its curve is force over w_over_h, that of .* p_over_pc over volume_change: draw"
     with pytest.raises(CaseError, match=said):
         runs_figure({run: rows[run], again: other}, OutputSection())
+
+
+def test_a_displacement_by_rounding_is_no_curve(run: Path) -> None:
+    """A step in which nothing moves, and one in which it does a little, before the path."""
+    (path,) = worth_drawing(drawn_parts(read_rows(run / "path.csv"), "pressure"))
+    still, little = (
+        replace(path, rows=[{**row, "volume_change": size * i**2} for i, row in enumerate(path.rows)])
+        for size in (1e-17, 1e-9)
+    )
+    assert [part.rows[-1] for part in worth_drawing([still, little, path])] == [little.rows[-1], path.rows[-1]]
 
 
 def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:

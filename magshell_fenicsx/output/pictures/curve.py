@@ -37,6 +37,7 @@ MARKS = {"fold": "o", "bifurcation": "D"}
 MARK = 3.5  # points
 HIDDEN = 12.0  # points: an unstable part as small as this is hidden by the marks at its ends
 AROUND = 0.8  # around such a part in its inset, over its size
+ROUNDING = 1e-9  # of the widest curve of the same kind: a curve that is as narrow as this is noise
 STRAIGHT = 0.005  # of its extent: a curve as near as this to its chord is a straight line
 INSET = 0.4  # of the axes
 CROWDED = 0.02  # of the points of all curves: an inset that covers more has no place
@@ -79,12 +80,24 @@ def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, plac
 
 def worth_drawing(parts: Sequence[Part]) -> list[Part]:
     """The steps without those of a single straight line; the last one always."""
-    return [*(part for part in parts[:-1] if _bends(part)), parts[-1]]
+    widths: dict[str, float] = defaultdict(float)  # of what is drawn to the right
+    names = [axes_for(part)[0].name for part in parts]
+    for name, part in zip(names, parts, strict=True):
+        widths[name] = max(widths[name], float(np.ptp(_points(part)[0])))
+    bent = (part for name, part in zip(names[:-1], parts[:-1], strict=True) if _bends(part, ROUNDING * widths[name]))
+    return [*bent, parts[-1]]
 
 
-def _bends(part: Part) -> bool:
-    """Whether the points of a curve are on no line."""
-    x, y = np.array([place(row, part.amplitude) for row in part.rows]).T
+def _points(part: Part) -> Array:
+    """The points of a curve (2, rows)."""
+    return np.array([place(row, part.amplitude) for row in part.rows]).T
+
+
+def _bends(part: Part, least: float) -> bool:
+    """Whether the points of a curve are on no line; what is narrower than the least is upright."""
+    x, y = _points(part)
+    if np.ptp(x) <= least:
+        return False
     wide, high = (float(np.ptp(values)) or 1.0 for values in (x, y))
     (a, b), x, y = np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high], (x - x[0]) / wide, (y - y[0]) / high
     return bool(len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0))
