@@ -164,6 +164,8 @@ def print_line(line: str) -> None:
     if world().rank == 0:
         with suppress(ValueError):  # elsewhere than in the main thread
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
+            if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+                signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the same under `nohup`
         terminal.print_line(line)
 
 
