@@ -141,7 +141,7 @@ def test_named_points_are_vertices(shell: dict[str, Any], place: list[float]) ->
 
 def test_the_width_of_a_strip_may_have_a_unit() -> None:
     """6 mm of 30 mm are the number 0.2; without a length in units there is nothing that it could be over."""
-    strip = {"geometry": "strip", "poisson_ratio": 0.3, "width": "6 mm"}
+    strip = {"geometry": "strip", "poisson_ratio": 0.3, "width": "6 mm", "youngs_modulus": "1 MPa"}
     data = {"shell": strip | {"radius": "30 mm", "thickness": "0.5 mm"}, "boundary": {"root": "clamped"}}
     data["loading"] = {"kind": "dead", "loads": [{"at": "A", "force": [0, 0, "1 mN"]}], "factor": 1}
     data["points"] = {"A": ["30 mm", 0, 0]}
