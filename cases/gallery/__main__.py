@@ -16,7 +16,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
-WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
+WIDTH = 420  # of a picture: 10 to 90 kB
 FIRST = (
     "identify.png",
     "designed.png",
@@ -87,7 +87,7 @@ def _shrink(source: Path, target: Path) -> None:
     picture = Image.open(source).convert("RGB")
     wide = WIDTH * (2 if picture.width > 1.5 * picture.height else 1)
     picture.thumbnail((wide, 10 * WIDTH))
-    picture.point(lambda value: STEP * round(value / STEP)).save(target, optimize=True)
+    picture.save(target, optimize=True)
 
 
 def main(names: list[str]) -> None:

@@ -250,7 +250,8 @@ def _panels(of: str, surface: Surface, style: OutputSection, camera: Camera, wid
         caption, values = f"{of.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
         if values.ndim == 1:
             limit = _limit(np.abs(values))
-            yield view.panel(Coloured(name, values, (-limit, limit), SIGNED, caption), style)
+            limits = from_zero(max(float(values.min()), -limit), min(float(values.max()), limit))
+            yield view.panel(Coloured(name, values, limits, SIGNED, caption), style)
             continue
         size = np.asarray(np.linalg.norm(values, axis=1))
         panel = view.panel(Coloured(name, size, (0.0, _limit(size)), "Reds", caption), style)
