@@ -118,7 +118,8 @@ class Table(dict[str, NDArray[np.generic]]):
     """Columns by name, each an array (rows,)."""
 
     def __missing__(self, key: object) -> NDArray[np.generic]:
-        raise KeyError(f"{key!r}: columns have names, such as {', '.join([*self][3:5])}; rows are those of `result.rows`")
+        names = ", ".join([*self][3:5])
+        raise KeyError(f"{key!r}: columns have names, such as {names}; rows are those of `result.rows`")
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A frame of pandas, which the package does not need otherwise.

@@ -52,7 +52,9 @@ def check_goes_on(out: Path, reference: Path, case: tuple[Path | str, ...] = LON
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "number"), [(2, signal.SIGTERM), (0, signal.SIGINT), (0, signal.SIGHUP), (2, signal.SIGUSR1)])
+@pytest.mark.parametrize(
+    ("ranks", "number"), [(2, signal.SIGTERM), (0, signal.SIGINT), (0, signal.SIGHUP), (2, signal.SIGUSR1)]
+)
 def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, number: signal.Signals) -> None:
     """Also if only one rank of two gets it; mpirun passes SIGUSR1 to all."""
     out = tmp_path / "out"
