@@ -13,6 +13,7 @@ from magshell_fenicsx.command import (
     INVALID,
     STOPPED,
     CaseFile,
+    Commands,
     Over,
     Result,
     Settings,
@@ -27,7 +28,7 @@ from magshell_fenicsx.command import (
 )
 from magshell_fenicsx.platform.terminal import open_standard_streams
 
-app = typer.Typer(
+app = Commands(
     help="Thin magnetic shells: deformation, indentation, buckling.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

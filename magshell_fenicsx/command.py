@@ -33,6 +33,22 @@ DELIVERED = 0.2  # s in which a message is on its way to the terminal
 UNWRITTEN = "kernels cannot be compiled into"
 
 
+class Command(typer.core.TyperCommand):
+    """A command whose help does not call None the default of what may be left out."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        for each in self.params:
+            each.show_default = each.default is not None and each.show_default  # type: ignore[attr-defined]
+
+
+class Commands(typer.Typer):
+    """Commands of a program."""
+
+    def command(self, *args: Any, **kwargs: Any) -> Any:
+        return super().command(*args, cls=Command, **kwargs)
+
+
 def case_files(incomplete: str) -> list[str]:
     """Case files with this beginning, here or one folder deeper; without any, the shell offers its own files."""
     begin = escape(incomplete)
@@ -148,6 +164,8 @@ def print_line(line: str) -> None:
     if world().rank == 0:
         with suppress(ValueError):  # elsewhere than in the main thread
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
+            if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+                signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the same under `nohup`
         terminal.print_line(line)
 
 

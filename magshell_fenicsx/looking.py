@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from magshell_fenicsx.command import (
     CaseFile,
+    Commands,
     Run,
     Runs,
     Settings,
@@ -24,7 +25,7 @@ from magshell_fenicsx.input.source import CaseError
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
 
-app = typer.Typer()
+app = Commands()
 
 
 @app.command()

@@ -159,7 +159,7 @@ def run(
 ) -> Result:
     """Run a problem.
 
-    With `out`, SIGTERM, SIGINT and SIGUSR1 stop the run after the current point, and it can be resumed.
+    With `out`, SIGTERM, SIGINT, SIGUSR1 and SIGHUP stop the run after the current point, and it can be resumed.
 
     Parameters
     ----------

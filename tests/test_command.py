@@ -58,6 +58,7 @@ def test_names_of_examples(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_script_for_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
     """Asks for what is tested above, and the options that install it are there."""
     assert "--install-completion" in magshell("--help").stdout
+    assert "None" not in magshell("run", "--help").stdout
     monkeypatch.setenv("_MAGSHELL_COMPLETE", "source_bash")
     script = magshell().stdout
     assert "_MAGSHELL_COMPLETE=complete_bash" in script

@@ -6,6 +6,7 @@ make gallery [ARGS="NAME..."]     # some cases alone: the page keeps the rows of
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -16,7 +17,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
-WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
+WIDTH = 420  # of a picture: 10 to 90 kB
 FIRST = (
     "identify.png",
     "designed.png",
@@ -32,6 +33,7 @@ OVER = {  # cases of magshell boundary -> the keys that vary
     "arch_boundary": ["loading.0.factor=0.5:1.9"],
     "snap_map": ["shell.defect.amplitude=0.4:2:4", "magnetic.lambda_m=-0.004:0.004:5"],
 }
+THUMB = 110  # pixels of a picture in the table at the head
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
@@ -68,6 +70,12 @@ def row(file: Path) -> str:
     )
 
 
+def thumbnails(names: Sequence[str]) -> str:
+    """All pictures in small, each a link to its part of the page."""
+    one = '[<img src="{0}.png" width="{1}" alt="{0}" title="{0}">](#{0})'
+    return "\n".join(one.format(name, THUMB) for name in names) + "\n"
+
+
 def telling(folder: Path) -> list[str]:
     """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode.
 
@@ -87,7 +95,7 @@ def _shrink(source: Path, target: Path) -> None:
     picture = Image.open(source).convert("RGB")
     wide = WIDTH * (2 if picture.width > 1.5 * picture.height else 1)
     picture.thumbnail((wide, 10 * WIDTH))
-    picture.point(lambda value: STEP * round(value / STEP)).save(target, optimize=True)
+    picture.save(target, optimize=True)
 
 
 def main(names: list[str]) -> None:
@@ -101,7 +109,8 @@ def main(names: list[str]) -> None:
         if not names or file.stem in names:
             known[file.stem] = row(file)
             print(file.stem, flush=True)
-        page.write_text("\n".join([HEAD, *(known[name].strip() + "\n" for name in sorted(known))]), encoding="utf-8")
+        parts = [HEAD, thumbnails(sorted(known)), *(known[name].strip() + "\n" for name in sorted(known))]
+        page.write_text("\n".join(parts), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -226,7 +226,8 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         first = modes[0]
         f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own[number])
         in_hertz = "" if f is None else f", {f:.6g} Hz"
-        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
+        of_mode = f", m = {wave}" if wave.isdigit() else wave and f", {wave}"
+        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}")
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):

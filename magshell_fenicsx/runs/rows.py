@@ -117,6 +117,10 @@ def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
 class Table(dict[str, NDArray[np.generic]]):
     """Columns by name, each an array (rows,)."""
 
+    def __missing__(self, key: object) -> NDArray[np.generic]:
+        names = ", ".join([*self][3:5])
+        raise KeyError(f"{key!r}: columns have names, such as {names}; rows are those of `result.rows`")
+
     def to_pandas(self) -> "pandas.DataFrame":
         """A frame of pandas, which the package does not need otherwise.
 

@@ -47,7 +47,8 @@ from magshell_fenicsx.simulate.results import barrier
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # mpirun passes SIGUSR1 on to the ranks and waits
+# mpirun passes SIGUSR1 on to the ranks and waits; SIGHUP is that of a terminal that is closed
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 __all__ = ["Result", "run"]
 
 Say = Callable[[str], None]
@@ -83,9 +84,14 @@ class Watch:
 
     def __enter__(self) -> Self:
         self._before: dict[signal.Signals, Callable[[int, FrameType | None], Any] | int | None] = {
-            number: signal.signal(number, self._note) for number in self._signals
+            number: signal.signal(number, signal.SIG_IGN if self._ignored(number) else self._note)
+            for number in self._signals
         }
         return self
+
+    def _ignored(self, number: signal.Signals) -> bool:
+        """Whether `nohup` has it ignored; PETSc would end the process."""
+        return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

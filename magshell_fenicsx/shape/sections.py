@@ -11,7 +11,9 @@ from magshell_fenicsx.input.section import (
     Length,
     Pressure,
     Section,
+    WithUnit,
     in_units,
+    with_unit,
 )
 from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
@@ -76,6 +78,16 @@ class MeshSurface(FileKeys, SurfaceSection):
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface
 
 
+def _over_the_length(value: Any, info: ValidationInfo) -> Any:
+    """The width of a strip over its length: a number unchanged, or text with a unit."""
+    if not isinstance(value, str):
+        return value
+    radius = info.data.get("radius")
+    if radius is None:
+        raise ValueError("a width with a unit needs radius and thickness with units; a number is over the length")
+    return in_units("metre")(value) / radius
+
+
 class OneShape(Section):
     """Shape, thickness and material."""
 
@@ -97,8 +109,18 @@ class OneShape(Section):
     """Multiplies h: a formula of x, y, z over R"""
     defect: Dimple | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
-    width: float | None = Field(default=None, gt=0, le=10)
-    """Of a strip, which must have one, over its length: a number without unit [length of the strip]"""
+    width: (
+        Annotated[
+            float,
+            WithUnit(
+                _over_the_length,
+                json_schema_input_type=Annotated[float, Field(gt=0, le=10)] | with_unit("metre"),
+                unit="metre",
+            ),
+        ]
+        | None
+    ) = Field(default=None, gt=0, le=10)
+    """Of a strip, which must have one: a number is over its length [length of the strip]"""
 
 
 class ShellSection(ShellKeys, OneShape):

@@ -56,11 +56,12 @@ def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:
     t = 2 * np.pi * np.arange(AROUND) / AROUND
     points, triangles = [], []
     start, next_one = 0, (np.arange(AROUND) + 1) % AROUND
+    on_axis = SAME * max(rho for profile in profiles for rho, _ in profile)  # a cosine of 90 degrees is not quite zero
     for profile in profiles:
         rings = list[NDArray[np.int64]]()
         for rho, z in profile:
             points.append(np.column_stack([rho * np.cos(t), rho * np.sin(t), np.full(AROUND, z)]))
-            rings.append(start + np.arange(AROUND) * (rho > 0))  # on the axis there is one point
+            rings.append(start + np.arange(AROUND) * (rho > on_axis))  # on the axis there is one point
             start += AROUND
         for low, high in pairwise(rings):
             triangles.append(np.column_stack([low, low[next_one], high[next_one]]))

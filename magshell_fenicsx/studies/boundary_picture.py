@@ -1,17 +1,20 @@
 """The picture of a boundary of stability: load over key, with the names of the regions."""
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from magshell_fenicsx.output.pictures.lines import smooth
+from magshell_fenicsx.output.pictures.scales import numbers
 from magshell_fenicsx.quantities.registry import amplitude, quantity
-from magshell_fenicsx.studies.points import short
+from magshell_fenicsx.studies.naming import key_label
 
 MARKS = {"cusp": "o", "turn": "s", "meeting": "D"}
 WORDS = {"cusp": "cusp", "turn": "turning point", "meeting": "second mode neutral"}
+LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 Row = Mapping[str, Any]
 
 
@@ -29,23 +32,19 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     import matplotlib.pyplot as plt
 
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for one, two in pairwise(rows):
-        first = not one["unstable"] and not two["unstable"]
-        plot.plot([one["key"], two["key"]], [one["load"], two["load"]], "-" if first else "--", color="C0")
-    for kind, mark in MARKS.items():
-        places = [(row["key"], row["load"]) for row in rows if row["kind"] == kind]
-        if places:
-            plot.plot(*zip(*places, strict=True), mark, color="C3", label=WORDS[kind], zorder=5)
+    for unstable, group in groupby(pairwise(rows), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])):
+        part = [*group]
+        _line(plot, [part[0][0], *(two for _, two in part)], color="C0", linestyle="--" if unstable else "-")
+    _marks(plot, "load", rows)
     for x, y, words in _regions(rows, content, plot.get_ylim()):
         plot.annotate(words, (x, y), ha="center", va="center", color="0.35")
     arms = _arms(rows)
     if arms:
         low, high = arms
-        outline = [*low, *reversed(high)]
-        plot.fill(*zip(*outline, strict=True), color="C0", alpha=0.12, linewidth=0)
-    unit = f"  ({content['unit']})" if content["unit"] else ""
+        x, y = (np.concatenate([one, two[::-1]]) for one, two in zip(_joined(low), _joined(high), strict=True))
+        plot.fill(x, y, color="C0", alpha=0.12, linewidth=0)
     label = quantity(amplitude(content["load"]).column).label
-    plot.set(xlabel=short(content["key"]).replace("_", " ") + unit, ylabel=label, title=content["case"])
+    plot.set(xlabel=key_label(content["key"], content["unit"]), ylabel=label, title=_title(content))
     if plot.get_legend_handles_labels()[1]:
         plot.legend(frameon=False, fontsize=8)
     figure.savefig(file, dpi=200)
@@ -65,39 +64,70 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (plot, plane) = plt.subplots(1, 2, figsize=(10.2, 4.2), layout="constrained")
-    names = [
-        short(key).replace("_", " ") + (f"  ({unit})" if unit else "")
-        for key, unit in zip(content["keys"], content["units"], strict=True)
-    ]
-    values = content["values"]
-    shade = plt.Normalize(min(values), max(values) if max(values) > min(values) else min(values) + 1)
-    for value in dict.fromkeys(row["second"] for row in rows):
+    others = [row for row in rows if row["amplitude"] != content["load"]]
+    empty = sorted(set(content["values"]) - {row["second"] for row in rows})
+    of_plane = bool(others or empty or any(row["kind"] in MARKS for row in rows))
+    wide = 10.2 if of_plane else 6.4
+    figure, plots = plt.subplots(1, 1 + of_plane, figsize=(wide, 4.4), layout="constrained", squeeze=False)
+    plot, plane = plots[0, 0], plots[0, -1]
+    names = [key_label(key, unit) for key, unit in zip(content["keys"], content["units"], strict=True)]
+    shade = plt.Normalize(min(content["values"]), max(content["values"]))
+    for value in sorted({row["second"] for row in rows}, reverse=True):
         line = [row for row in rows if row["second"] == value]
-        colour = plt.cm.viridis(0.9 * shade(value))
-        keys, loads = [row["key"] for row in line], [row["load"] for row in line]
-        other = line[0]["amplitude"] != content["load"]
-        if not other:
-            plot.plot(keys, loads, color=colour, label=f"{value:g}")
-        how = {"ls": "--", "lw": 1.2, "label": f"by {line[0]['amplitude']}"} if other else {"lw": 3, "alpha": 0.6}
-        plane.plot([min(keys), max(keys)], [value, value], color=colour, **how)
-    for kind, mark in MARKS.items():
-        own = [row for row in rows if row["kind"] == kind]
-        if own:
-            drawn = [row for row in own if row["amplitude"] == content["load"]]
-            plot.plot([row["key"] for row in drawn], [row["load"] for row in drawn], mark, color="C3", zorder=5)
-            plane.plot(
-                [r["key"] for r in own], [r["second"] for r in own], mark, color="C3", label=WORDS[kind], zorder=5
-            )
-    for value in set(values) - {row["second"] for row in rows}:
-        plane.plot(content["range"], [value, value], ":", color="0.5")
-    plot.set(xlabel=names[0], ylabel=quantity(amplitude(content["load"]).column).label, title=content["case"])
-    plot.legend(frameon=False, fontsize=8, title=names[1], title_fontsize=8)
-    plane.set(xlabel=names[0], ylabel=names[1], title="where it loses its stability (dotted: nowhere)")
-    if plane.get_legend_handles_labels()[1]:
-        plane.legend(frameon=False, fontsize=8)
+        if line[0] not in others:
+            _line(plot, line, color=plt.cm.viridis(0.9 * shade(value)), marked=True, label=numbers([value])[0][0])
+    _marks(plot, "load", [row for row in rows if row not in others])
+    plot.set(xlabel=names[0], ylabel=quantity(amplitude(content["load"]).column).label, title=_title(content))
+    plot.legend(**LEGEND, title=names[1], title_fontsize=8)
+    if of_plane:
+        _plane(plane, rows, content, empty)
+        plane.set(xlabel=names[0], ylabel=names[1], title="where it loses its stability")
+        plane.legend(**LEGEND)
     figure.savefig(file, dpi=200)
     plt.close(figure)
+
+
+def _plane(plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]) -> None:
+    """Lines of both keys on which there is an instability, by which load, and where there is none."""
+    named = set[str]()
+
+    def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:
+        plane.plot([min(x), max(x)], [value] * 2, label="" if words in named else words, **style)
+        named.add(words)
+
+    for value, group in groupby(rows, key=lambda row: float(row["second"])):
+        line = [*group]
+        by = quantity(amplitude(line[0]["amplitude"]).column).words
+        colour = "C0" if line[0]["amplitude"] == content["load"] else "C1"
+        draw([row["key"] for row in line], value, f"by the {by}", color=colour, lw=2)
+    for value in empty:
+        draw(content["range"], value, "nowhere", color="0.5", ls=":")
+    _marks(plane, "second", rows)
+
+
+def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
+    """Cusps, turning points and second modes."""
+    for kind, mark in MARKS.items():
+        places = [(row["key"], row[upwards]) for row in rows if row["kind"] == kind]
+        if places:
+            plot.plot(*zip(*places, strict=True), mark, color="C3", label=WORDS[kind], zorder=5)
+
+
+def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) -> None:
+    """A smooth line through the points of a boundary, with dots where one is to see them."""
+    x, y = _joined([(row["key"], row["load"]) for row in rows], [row["kind"] in MARKS for row in rows])
+    plot.plot(x, y, **style)
+    if marked:
+        plot.plot(*zip(*[(row["key"], row["load"]) for row in rows], strict=True), ".", ms=4, color=style["color"])
+
+
+def _joined(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
+    return smooth(*map(list, zip(*places, strict=True)), located)
+
+
+def _title(content: Mapping[str, Any]) -> str:
+    """The case, and what is set in it."""
+    return ", ".join([Path(content["case"]).stem.replace("_", " "), *content.get("settings", ())])
 
 
 def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:

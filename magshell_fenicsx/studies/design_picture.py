@@ -13,6 +13,7 @@ from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design_blocks import Between
 from magshell_fenicsx.studies.design_variables import Variables
+from magshell_fenicsx.studies.naming import result_words, split_unit
 
 Array = NDArray[np.float64]
 
@@ -100,14 +101,14 @@ def _draw_history(
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         until = np.append(number[best], number[-1:] if best.any() else [])
         reached = np.append(values[best], values[best][-1:])
-        axes.plot(until, reached, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=_name(result))
+        axes.plot(until, reached, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=result_words(result))
         if result in asked:
             axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
             axes.set_yscale("log")
     shown = unit if unit in {"Hz", *endings().values()} else ""
     several = shown or "results"
-    axes.set_ylabel(_name(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
+    axes.set_ylabel(result_words(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
 
@@ -155,39 +156,10 @@ def _unit(result: str) -> str:
     """
     if found := re.fullmatch(r"(omega2|hertz)_\d+", result):
         return {"omega2": "omega2", "hertz": "Hz"}[found[1]]
-    if given := _in_units(result):
+    if given := split_unit(result):
         return given[1]
     own = {"critical_field": quantity("lambda_m").scale, "barrier": quantity("energy").scale, "shape": "shape"}
     return own.get(result) or quantity(result).scale
-
-
-def _in_units(result: str) -> tuple[str, str] | None:
-    """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
-    units = endings()
-    for ending in sorted(units, key=len, reverse=True):
-        if result.endswith(f"_{ending}"):
-            return result.removesuffix(f"_{ending}"), units[ending]
-    return None
-
-
-def _name(result: str) -> str:
-    """A result in words or symbols, without its unit.
-
-    Examples
-    --------
-    >>> _name("tip_fz"), _name("omega2_1"), _name("hertz_2"), _name("knockdown"), _name("tip_uz_mm")
-    ('tip $f_z$', '$\\\\omega_{1}^2 \\\\rho R^2/E$', 'frequency 2', 'knockdown', 'tip $u_z$')
-    """
-    if result == "shape":
-        return "mean square distance over $R^2$"
-    if found := re.fullmatch(r"omega2_(\d+)", result):
-        return rf"$\omega_{{{found[1]}}}^2 \rho R^2/E$"
-    if found := re.fullmatch(r"hertz_(\d+)", result):
-        return f"frequency {found[1]}"
-    result = given[0] if (given := _in_units(result)) else result
-    if found := re.fullmatch(r"(.+)_([fu])([xyz])", result):
-        return f"{found[1].replace('_', ' ')} ${found[2]}_{found[3]}$"
-    return result.replace("_", " ")
 
 
 def _draw_field(axes: Any, field: Between, values: Array) -> None:

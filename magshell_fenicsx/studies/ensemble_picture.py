@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.statistics import RESULT, WITHOUT, Row, correlations, fit, results
+from magshell_fenicsx.studies.statistics import RESULT, WITHOUT, Row, Weibull, correlations, fit, results
 
 Array = NDArray[np.float64]
 KNOCKDOWN = r"knockdown factor  $k_\mathrm{d}$"
@@ -27,12 +27,17 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
 
     values, label = results(rows), KNOCKDOWN if name == "knockdown" else name
     strongest = max(correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None)
-    panels = 2 + (strongest is not None)
+    fitted = fit(values) if len(values) else None
+    with_density = fitted is not None or len(values) >= FEW  # marks alone have none
+    panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
-    density, function, *others = figure.subplots(1, panels, squeeze=False)[0]
-    density.set(xlabel=label, ylabel="probability density")
+    *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]
+    others = figure.axes[1 + with_density :]
+    if density:
+        density[0].set(xlabel=label, ylabel="probability density")
+        _draw_density(density[0], values, fitted)
     if len(values):
-        _draw_distribution(density, function, values, results(rows, WITHOUT))
+        _draw_function(function, values, results(rows, WITHOUT), fitted)
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
     if strongest:
         _draw_correlation(others[0], rows, strongest[0], label)
@@ -41,26 +46,35 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     figure.savefig(file)
 
 
-def _draw_distribution(density: Any, function: Any, values: Array, without: Array) -> None:
-    """The density and the distribution function, of the samples and of Weibull's distribution."""
-    fitted = fit(values)
+def _places(values: Array, fitted: Weibull) -> Array:
+    """Where a fitted curve is drawn: from its lowest value that is likely."""
+    least = float(values.min())
+    low = max(fitted.quantile(TAIL), least - np.ptp(values))
+    return np.linspace(min(low, least), values.max() + 0.1 * np.ptp(values), 400)
+
+
+def _draw_density(density: Any, values: Array, fitted: Weibull | None) -> None:
+    """The histogram, a mark for each sample, and Weibull's distribution."""
     if len(values) >= FEW:
         density.hist(values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4)
     density.plot(values, np.zeros(len(values)), "|", color="C0", markersize=14, clip_on=False, label="samples")
-    ordered, least = np.sort(values), float(values.min())
+    if fitted:
+        x = _places(values, fitted)
+        density.plot(x, fitted.density(x), color="C3")
+    density.set_ylim(bottom=0)
+
+
+def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull | None) -> None:
+    """The distribution function of the samples and of Weibull's distribution."""
+    ordered = np.sort(values)
     part = np.arange(len(values) + 1) / len(values)
     function.step(np.append(ordered[:1], ordered), part, where="post", color="C0", label=f"{len(values)} samples")
     if len(less := np.sort(without)):
         part = np.arange(1, len(less) + 1) / len(less)
         function.step(less, part, where="post", color="C2", linewidth=1, label="without the weakest defects")
     if fitted:
-        low = max(fitted.quantile(TAIL), least - np.ptp(values))
-        x = np.linspace(min(low, least), values.max() + 0.1 * np.ptp(values), 400)
-        density.plot(x, fitted.density(x), color="C3")
+        x = _places(values, fitted)
         function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
-    density.set_ylim(bottom=0)
-    if len(values) < FEW and not fitted:  # marks alone have no density
-        density.set(yticks=[], ylabel="")
     function.legend(frameon=False, fontsize=8)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.points import short
+from magshell_fenicsx.studies.naming import key_words, result_label
 
 Row = Mapping[str, Any]
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def _data(plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, 
         half = [get("predicted") - get("low_measured"), get("high_measured") - get("predicted")]
         plot.errorbar(x, get("predicted"), half, fmt="_", color="C0", label="fitted, 95 %")
     plot.plot(x, get("measured"), ".", color="C1", label="measured", zorder=5)
-    plot.set(xlabel=content["places"].replace("_", " ") if placed else "number", ylabel=of.replace("_", " "))
+    plot.set(xlabel=result_label(content["places"]) if placed else "number", ylabel=result_label(of))
     plot.legend(frameon=False, fontsize=8)
 
 
@@ -81,7 +81,7 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
         low, high = ((each[name] - each["value"]) / size for name in ("low", "high"))
         plot.barh(i, 100 * (high - low), left=100 * low, height=0.25, color="C0")
         widest = max(widest, high)
-    names = [f"{short(key).replace('_', ' ')}\n{p['value']:.4g} {p['unit']}".rstrip() for key, p in parameters.items()]
+    names = [f"{key_words(key, p['unit'])}\n{p['value']:.4g} {p['unit']}".rstrip() for key, p in parameters.items()]
     plot.set_yticks(range(len(names)), names, fontsize=8)
     plot.set(xlabel="95 % bands: data (blue), prior (grey), in %", xlim=(-120 * widest, 120 * widest))
     plot.axvline(0.0, color="0.4", lw=0.6)

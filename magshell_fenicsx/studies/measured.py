@@ -91,6 +91,7 @@ def complete(measured: Timings, arguments: Sequence[str], ranks: int, repeat: in
     while not measured.failure and len(measured.samples) < repeat:
         sample = _run_once(measured, arguments, ranks)
         if measured.summary is not None and not _is_of(origin, measured.summary):
+            measured.summary, measured.rows = None, []
             measured.failure = "the program or the mesh file was changed during the study"
         if measured.first is None:
             measured.first = sample

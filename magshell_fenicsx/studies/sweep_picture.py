@@ -10,7 +10,8 @@ import numpy as np
 
 from magshell_fenicsx.input.section import given
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
-from magshell_fenicsx.studies.points import Axis, SweepPoint, along, short
+from magshell_fenicsx.studies.naming import key_label, key_symbol, key_words
+from magshell_fenicsx.studies.points import Axis, SweepPoint, along
 from magshell_fenicsx.studies.runner import Outcome
 
 if TYPE_CHECKING:
@@ -20,13 +21,6 @@ if TYPE_CHECKING:
 
 LEGEND_ROWS = 16
 STYLES = ("-", "--", ":", "-.")
-UNITS = {"polar": "degrees", "azimuth": "degrees"}
-NAMES = {  # words and symbol of keys
-    "lambda_m": ("field", r"$\lambda_\mathrm{m}$"),
-    "poisson_ratio": ("Poisson's ratio", r"$\nu$"),
-    "radius_to_thickness": ("radius over thickness", "$R/h$"),
-    "amplitude": ("amplitude over $h$", ""),
-}
 MAPPED = 3  # least different values of both axes of a map
 SMOOTH = 8  # least for contours; fewer are cells with their values
 WRITTEN, LONGEST, BRIGHT = 9, 5, 0.6  # most columns and digits of written values; colours from here on are bright
@@ -202,22 +196,8 @@ def _scales(size: float) -> tuple[Any, Any]:
 
 
 def _axis_label(axis: Axis) -> str:
-    unit = axis.unit or UNITS.get(axis.keys[0].split(".")[-1])
-    return " = ".join(_words(key) for key in axis.keys) + (f"  ({unit})" if unit else "")
-
-
-def _words(key: str) -> str:
-    """The name of a key on an axis: that of the field says whose it is.
-
-    Examples
-    --------
-    >>> _words("magnetic.applied.flux_density"), _words("shell.radius_to_thickness")
-    ('applied flux density', 'radius over thickness  $R/h$')
-    """
-    if short(key) in NAMES:
-        return "  ".join(part for part in NAMES[short(key)] if part)
-    words = " ".join(key.split(".")[-2:]) if key.endswith(".flux_density") else short(key)
-    return words.replace("_", " ")
+    *tied, last = axis.keys
+    return " = ".join([*(key_words(key, axis.unit) for key in tied), key_label(last, axis.unit)])
 
 
 def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
@@ -244,10 +224,4 @@ def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
 
 def _label(point: SweepPoint, without: Axis | None) -> str:
     hidden = without.keys if without else ()
-    return ", ".join(f"{_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden)
-
-
-def _symbol(key: str) -> str:
-    """A key before its value: its symbol with a sign of equality, or its words."""
-    words, symbol = NAMES.get(short(key), (short(key).replace("_", " "), ""))
-    return f"{symbol} = " if symbol else f"{words} "
+    return ", ".join(f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden)

@@ -8,6 +8,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
@@ -136,6 +137,18 @@ def test_named_points_are_vertices(shell: dict[str, Any], place: list[float]) ->
     x = np.array(place) / R
     assert surface.points["A"] == pytest.approx(x, abs=1e-9)
     assert np.linalg.norm(surface.mesh.geometry.x - x, axis=1).min() < 1e-9
+
+
+def test_the_width_of_a_strip_may_have_a_unit() -> None:
+    """6 mm of 30 mm are the number 0.2; without a length in units there is nothing that it could be over."""
+    strip = {"geometry": "strip", "poisson_ratio": 0.3, "width": "6 mm", "youngs_modulus": "1 MPa"}
+    data = {"shell": strip | {"radius": "30 mm", "thickness": "0.5 mm"}, "boundary": {"root": "clamped"}}
+    data["loading"] = {"kind": "dead", "loads": [{"at": "A", "force": [0, 0, "1 mN"]}], "factor": 1}
+    data["points"] = {"A": ["30 mm", 0, 0]}
+    assert Case.model_validate(data).width == pytest.approx(0.2, rel=1e-12)
+    data["shell"] = strip | {"radius_to_thickness": 60}
+    with pytest.raises(ValidationError, match="a width with a unit needs radius and thickness with units"):
+        Case.model_validate(data)
 
 
 DENSITIES = {"remanent": {"flux_density": "60 mT"}, "applied": {"flux_density": "50 mT"}}

@@ -10,6 +10,7 @@ from conftest import CASES
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, solids, vtp_content
+from magshell_fenicsx.shape.solids import cylinder, globe
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
 STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"
@@ -67,3 +68,13 @@ def test_bodies_are_where_their_approach_has_brought_them() -> None:
             np.array([lines.min(axis=0), lines.max(axis=0)]), abs=2e-3
         )
         np.testing.assert_allclose(np.ptp(lines, axis=0)[:2].min(), wide, rtol=3e-3)
+
+
+def test_a_sphere_has_no_creases() -> None:
+    """Its poles once had: the cosine of 90 degrees is 6e-17, and lines around it made a black spot."""
+    ball = globe(2.0)
+    assert ball.creases == []
+    corners = ball.points[ball.triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert areas.sum() == pytest.approx(16 * np.pi, rel=1e-2)
+    assert len(cylinder(1.0, 2.0).creases) > 0

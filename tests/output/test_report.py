@@ -127,6 +127,8 @@ def test_where_it_buckles(tmp_path: Path) -> None:
     place = [0.0252 * sin(radians(50)) * f(radians(120)) for f in (cos, sin)] + [0.0252 * cos(radians(50))]
     text = page(tmp_path, [FOLD], limit_points=[{"mode_at": place}]).text
     assert "w/h = 3.4 at the pole; its mode is largest at polar 50°, azimuth 120°." in text
+    beside = page(tmp_path, [FOLD], limit_points=[{"mode_at": [0.0, 0.0252 * sin(radians(3)), 0.0252]}]).text
+    assert "its mode is largest near the pole." in beside
     case = SUMMARY["case"] | {"shell": {"geometry": "cylinder"}}
     text = page(tmp_path, [FOLD], limit_points=[{"mode_at": [0.0252, 0, -0.001]}], case=case).text
     assert "its mode is largest at (25.2, 0, -1) mm." in text

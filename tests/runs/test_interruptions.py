@@ -52,7 +52,9 @@ def check_goes_on(out: Path, reference: Path, case: tuple[Path | str, ...] = LON
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "number"), [(2, signal.SIGTERM), (0, signal.SIGINT), (2, signal.SIGUSR1)])
+@pytest.mark.parametrize(
+    ("ranks", "number"), [(2, signal.SIGTERM), (0, signal.SIGINT), (0, signal.SIGHUP), (2, signal.SIGUSR1)]
+)
 def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, number: signal.Signals) -> None:
     """Also if only one rank of two gets it; mpirun passes SIGUSR1 to all."""
     out = tmp_path / "out"
@@ -105,6 +107,22 @@ def test_second_interrupt_stops_at_once() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.signal(signal.SIGINT, found) is signal.default_int_handler
+
+
+def test_nohup_is_obeyed() -> None:
+    """A hang-up that was ignored at the start stays so, though PETSc takes it; else it stops the run."""
+    found = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Watch(MPI.COMM_SELF, 0.0, None, signals=True) as watch:
+            signal.raise_signal(signal.SIGHUP)
+            watch.check()
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        with Watch(MPI.COMM_SELF, 0.0, None, signals=True) as watch:
+            signal.raise_signal(signal.SIGHUP)
+            with pytest.raises(Interrupted, match="SIGHUP"):
+                watch.check()
+    finally:
+        signal.signal(signal.SIGHUP, found or signal.SIG_DFL)
 
 
 def test_time_limit(tmp_path: Path, reference: Path, no_pictures: None) -> None:

@@ -33,6 +33,8 @@ def test_history_is_a_table(result: ms.Result) -> None:
     assert frame["p_over_pc"].iloc[-1] == result.knockdown
     assert frame.query("label == 'fold'").shape[0] == 1
     assert frame["volume_change"].dtype == np.float64
+    with pytest.raises(KeyError, match="-1: columns have names, such as p_over_pc"):
+        table[-1]  # type: ignore[index]
 
 
 def test_columns_are_the_same(result: ms.Result) -> None:

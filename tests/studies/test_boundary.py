@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.pictures.scales import numbers
+from magshell_fenicsx.studies.boundary_picture import draw_map
 
 ARCH = CASES / "arch_boundary.yaml"
 KEY = "loading.0.factor"
@@ -165,3 +168,30 @@ def test_what_is_no_map(tmp_path: Path, second: str, said: str) -> None:
         ms.boundary(ARCH, [f"{KEY}=1.1:1.3:2", second], [], tmp_path / "b")
     with pytest.raises(CaseError, match="3 keys; a boundary takes one"):
         ms.boundary(ARCH, [f"{KEY}=1.1:1.3:2", second, second], [], tmp_path / "b")
+
+
+def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Symbols for keys, signs of minus, words for loads; no second panel where all lines end by the same load."""
+    import matplotlib.pyplot as plt
+
+    drawn: list[Any] = []
+    monkeypatch.setattr(plt, "close", drawn.append)
+    content = {
+        "case": "a_map.yaml", "keys": ["shell.defect.amplitude", "magnetic.lambda_m"], "units": ["", ""],
+        "range": [0.4, 2.0], "values": [-0.004, -0.002, 0.0], "load": "pressure",
+    }  # fmt: skip
+    loads = {-0.002: "pressure", -0.004: "lambda_m"}
+    rows = [
+        {"second": second, "amplitude": load, "key": key, "load": key / 4, "kind": "fold", "unstable": 0}
+        for second, load in loads.items()
+        for key in (0.4, 1.0, 2.0)
+    ]
+    draw_map(rows, content, tmp_path / "both.png")
+    draw_map(rows[:3], content | {"values": [-0.002]}, tmp_path / "one.png")
+    both, one = drawn
+    assert [axes.get_xlabel() for axes in both.axes] == 2 * ["amplitude over $h$"]
+    assert both.axes[1].get_ylabel() == r"field  $\lambda_\mathrm{m}$"
+    assert [text.get_text() for text in both.axes[0].get_legend().get_texts()] == [numbers([-0.002])[0][0]]
+    said = [text.get_text() for text in both.axes[1].get_legend().get_texts()]
+    assert said == ["by the pressure", "by the field", "nowhere"]
+    assert len(one.axes) == 1

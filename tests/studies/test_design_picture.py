@@ -16,7 +16,7 @@ MANY = ["buckling_pressure_Pa", "mass", "tip_uz_mm", "w_mm", "knockdown", "tip_f
 @pytest.mark.parametrize(
     ("results", "labels"),
     [
-        (MANY, ["buckling pressure  (Pa)", "results", "mm", "tip $f_z$  (N)", "Hz"]),
+        (MANY, ["buckling pressure  (Pa)", "results", "mm", "$f_z$ of tip  (N)", "Hz"]),
         (["mass"], ["mass"]),
         (["critical_field", "force"], ["critical field", "force"]),
     ],

@@ -29,6 +29,8 @@ from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.studies import compare as runs
 from magshell_fenicsx.studies import measured as sample
 from magshell_fenicsx.studies import sweep as chain
+from magshell_fenicsx.studies.results import parse_scalar
+from magshell_fenicsx.studies.study import _outcome
 
 PACKAGE, BUCKLING = Path(magshell_fenicsx.__file__).parent, CASES / "dimple_buckling.yaml"
 QUICK = ["mesh.degree=3", "mesh.refinement=0.3"]
@@ -215,6 +217,7 @@ def test_a_program_that_changes_under_a_study(tmp_path: Path, monkeypatch: pytes
     measured = sample.Timings({})
     sample.complete(measured, ["case"], 1, 3, tmp_path / "kept.json", {"sources": OTHER})
     assert measured.failure == "the program or the mesh file was changed during the study"
+    assert _outcome(measured, parse_scalar("knockdown")) == f"stopped early: {measured.failure}"
     assert not measured.samples
 
 

@@ -67,8 +67,9 @@ def small_panels(
     captions: Sequence[str],
     style: OutputSection,
     camera: Camera,
+    note: str = "",
 ) -> "Figure":
-    """All in one window, with captions above them; the layers have the same limits."""
+    """All in one window, with captions above them; the layers have the same limits. A note stands at the foot."""
     from matplotlib.figure import Figure
 
     number, line, gap = len(surfaces), LINE * style.font_size, GAP / INCH
@@ -80,18 +81,20 @@ def small_panels(
     tall = window.shape[0] / style.dpi
     lines = max(caption.count("\n") + 1 for caption in captions)
     each, below = tall + lines * line + gap / 2, 4.4 * line
-    height = -(-number // across) * each + below
+    foot = line if note else 0.0
+    height = -(-number // across) * each + below + foot
     figure = Figure(figsize=(width, height), dpi=style.dpi)
     boxes = Boxes(figure)
+    figure.text(*boxes.place(gap / 2, 0.5 * line), note, va="center", fontsize=0.9 * style.font_size)
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
         panel = Background(surface, camera, 0, window).panel(layer, style)
         left, low = i % across * wide, height - (i // across + 1) * each
         draw_panel(boxes.axes(left + gap / 2, low, wide - gap, tall), panel, style)
         figure.text(*boxes.place(left + wide / 2, low + tall + lines * line / 2), caption, ha="center", va="center")
     reach = min(width - gap - 8 * line, 4.0)
-    box = boxes.axes((width - reach) / 2, 1.7 * line, reach, 0.65 * line)
+    box = boxes.axes((width - reach) / 2, foot + 1.7 * line, reach, 0.65 * line)
     colour_bar(figure, box, panel.scale, room=reach)
-    directions(boxes.axes(gap / 2, 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
+    directions(boxes.axes(gap / 2, foot + 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
     return figure
 
 
@@ -124,11 +127,12 @@ def _name(row: Row) -> str:
 
 
 SHOWN = 0.05  # drawn size of a mode's largest displacement, over R
+MOST_PANELS = 12
 CAPTION = "$w$ of the mode over its largest, of any sign"
 
 
 def modes_figure(
-    surfaces: Sequence[Surface], captions: Sequence[str], style: OutputSection, camera: Camera
+    surfaces: Sequence[Surface], captions: Sequence[str], style: OutputSection, camera: Camera, most: int = MOST_PANELS
 ) -> "Figure":
     """Draw one small panel per mode: the deformed shell plus the mode, coloured by the mode's normal displacement.
 
@@ -138,17 +142,18 @@ def modes_figure(
         With the fields "mode" and "mode_w"; see `fields.modes`.
     captions
         Of the panels, in matplotlib's mathematics.
+    most
+        Panels; the picture says how many modes it leaves out.
     """
+    note = f"The first {most} of {len(captions)} modes." if len(captions) > most else ""
+    surfaces, captions = surfaces[:most], captions[:most]
     moved = [replace(surface, u=surface.u + SHOWN * surface.fields["mode"]) for surface in surfaces]
     layers = []
     for surface in surfaces:
         w = surface.fields["mode_w"]
         layers.append(Coloured("mode_w", w / (np.abs(w).max() or 1.0), (-1.0, 1.0), SIGNED, CAPTION))
     with drawing(style):
-        return small_panels(moved, layers, captions, style, camera)
-
-
-MOST_PANELS = 12
+        return small_panels(moved, layers, captions, style, camera, note)
 
 
 @dataclass(frozen=True)
@@ -182,7 +187,7 @@ def mode_figures(
 
 
 def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera) -> "Figure":
-    surfaces, captions = zip(*panels[:MOST_PANELS], strict=True)
+    surfaces, captions = zip(*panels, strict=True)
     return modes_figure(surfaces, captions, style, camera)
 
 
@@ -245,7 +250,8 @@ def _panels(of: str, surface: Surface, style: OutputSection, camera: Camera, wid
         caption, values = f"{of.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
         if values.ndim == 1:
             limit = _limit(np.abs(values))
-            yield view.panel(Coloured(name, values, (-limit, limit), SIGNED, caption), style)
+            limits = from_zero(max(float(values.min()), -limit), min(float(values.max()), limit))
+            yield view.panel(Coloured(name, values, limits, SIGNED, caption), style)
             continue
         size = np.asarray(np.linalg.norm(values, axis=1))
         panel = view.panel(Coloured(name, size, (0.0, _limit(size)), "Reds", caption), style)

@@ -7,7 +7,7 @@ import base64
 import importlib.util
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -177,7 +177,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     """The numbers of path.csv that vary, names of columns, and the lines of the curve of each step."""
     varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
     parts = _parts(rows, varied) if varied else []
-    known = {each.name: each for name in rows[0] for q in [quantity(name)] for each in (q, *q.in_units)}
+    known = _known(rows[0])
     first = list[str]()
     for part in reversed(parts):  # its words say whose displacement it is
         known |= {q.name: q for q in axes_for(part)}
@@ -197,6 +197,21 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         "unstable": [is_unstable(row) for row in rows],
         "times": [row["time"] for row in rows] if "time" in rows[0] else [],
     }
+
+
+def _known(names: Iterable[str]) -> dict[str, Quantity]:
+    """Column -> its quantity: one in units comes after its own and has its words.
+
+    Examples
+    --------
+    >>> _known(["w_over_h", "w_mm"])["w_mm"].label
+    'displacement  $w$  (mm)'
+    """
+    known = dict[str, Quantity]()
+    for of in map(quantity, names):
+        for each in (of, *of.in_units):
+            known.setdefault(each.name, each)
+    return known
 
 
 def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ DIGITS = 6
 LEAST_BEYOND = 0.1  # per cent of an overshoot
 Summary = Mapping[str, Any]
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
+NEAR_POLE = 5.0  # degrees: a dimple at the pole is deepest on a ring as small as this, at no azimuth
 
 
 def number(value: float, digits: int = DIGITS) -> Markup:
@@ -309,6 +310,8 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
     known = summary["dimensions"]
     in_metres = bool(known["radius"]) and known["units"] == "SI"
     key, numbers = next(iter(place_in_units(place, shell_of(summary["case"])["geometry"], in_metres=in_metres).items()))
+    if key == "degrees" and numbers[0] < NEAR_POLE:
+        return Markup("; its mode is largest near the pole")
     if key == "degrees":
         found = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
     else:

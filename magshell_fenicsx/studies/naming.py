@@ -1,0 +1,105 @@
+"""Keys and results as a paper names them, for pictures."""
+
+import re
+
+from magshell_fenicsx.quantities.registry import QUANTITIES, endings
+from magshell_fenicsx.studies.points import short
+
+UNITS = {"polar": "degrees", "azimuth": "degrees"}
+NAMES = {  # words and symbol of keys
+    "lambda_m": ("field", r"$\lambda_\mathrm{m}$"),
+    "poisson_ratio": ("Poisson's ratio", r"$\nu$"),
+    "radius_to_thickness": ("radius over thickness", "$R/h$"),
+    "youngs_modulus": ("Young's modulus", "$E$"),
+}
+
+
+def key_words(key: str, unit: str = "") -> str:
+    """The name of a key on an axis: that of a field says whose it is, and that of a step which one.
+
+    Examples
+    --------
+    >>> key_words("magnetic.applied.flux_density"), key_words("shell.radius_to_thickness")
+    ('applied flux density', 'radius over thickness  $R/h$')
+    >>> key_words("shell.defect.amplitude"), key_words("shell.defect.amplitude", "mm"), key_words("loading.0.factor")
+    ('amplitude over $h$', 'amplitude', 'factor of step 1')
+    >>> key_words("magnetic.applied.sources.0.position.2")
+    'position z'
+    """
+    name = short(key)
+    if name in NAMES:
+        return "  ".join(part for part in NAMES[name] if part)
+    if name == "amplitude" and not unit:
+        return "amplitude over $h$"
+    *_, parent, last = ("", *key.split("."))
+    words = f"{parent} {last}" if last == "flux_density" or last.isdigit() else name
+    words = re.sub(r"^position ([012])$", lambda found: f"position {'xyz'[int(found[1])]}", words)
+    step = re.match(r"loading\.(\d+)\.", key)
+    return words.replace("_", " ") + (f" of step {int(step[1]) + 1}" if step else "")
+
+
+def key_label(key: str, unit: str = "") -> str:
+    """A key and its unit on an axis."""
+    unit = unit or UNITS.get(key.split(".")[-1], "")
+    return key_words(key, unit) + (f"  ({unit})" if unit else "")
+
+
+def key_symbol(key: str) -> str:
+    """A key before its value: its symbol with a sign of equality, or its words.
+
+    Examples
+    --------
+    >>> key_symbol("magnetic.lambda_m"), key_symbol("mesh.degree")
+    ('$\\\\lambda_\\\\mathrm{m}$ = ', 'degree ')
+    """
+    symbol = NAMES.get(short(key), ("", ""))[1]
+    return f"{symbol} = " if symbol else f"{key_words(key)} "
+
+
+def split_unit(result: str) -> tuple[str, str] | None:
+    """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
+    units = endings()
+    for ending in sorted(units, key=len, reverse=True):
+        if result.endswith(f"_{ending}"):
+            return result.removesuffix(f"_{ending}"), units[ending]
+    return None
+
+
+def result_words(result: str) -> str:
+    """A result in words or symbols, without its unit.
+
+    Examples
+    --------
+    >>> result_words("tip_fz"), result_words("omega2_1"), result_words("hertz_2"), result_words("knockdown")
+    ('$f_z$ of tip', '$\\\\omega_{1}^2 \\\\rho R^2/E$', 'frequency 2', 'knockdown factor  $k_\\\\mathrm{d}$')
+    >>> result_words("tip_uz_mm"), result_words("buckling_pressure_Pa")
+    ('$u_z$ of tip', 'buckling pressure')
+    """
+    if result == "shape":
+        return "mean square distance over $R^2$"
+    if result == "knockdown":
+        return r"knockdown factor  $k_\mathrm{d}$"
+    if found := re.fullmatch(r"omega2_(\d+)", result):
+        return rf"$\omega_{{{found[1]}}}^2 \rho R^2/E$"
+    if found := re.fullmatch(r"hertz_(\d+)", result):
+        return f"frequency {found[1]}"
+    result = given[0] if (given := split_unit(result)) else result
+    if found := re.fullmatch(r"(.+)_([fum])([xyz])", result):
+        return f"${found[2]}_{found[3]}$ of {found[1].replace('_', ' ')}"
+    return result.replace("_", " ")
+
+
+def result_label(result: str) -> str:
+    """A result and its unit on an axis, as the curve of a run names it.
+
+    Examples
+    --------
+    >>> result_label("applied_mT"), result_label("tip_uz_mm"), result_label("hertz_1")
+    ('applied field  $B_\\\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
+    """
+    for each in QUANTITIES.values():
+        for shown in (each, *each.in_units):
+            if shown.name == result:
+                return shown.label
+    unit = "Hz" if result.startswith("hertz_") else given[1] if (given := split_unit(result)) else ""
+    return result_words(result) + (f"  ({unit})" if unit else "")
