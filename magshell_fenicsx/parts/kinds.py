@@ -71,8 +71,6 @@ class ShellKeys(LawKeys):
     def _laminate_fits(self) -> Self:
         if self.laminate and self.law != "koiter":
             raise ValueError(f"laminate: needs law: koiter: its strains are small; here the law is {self.law}")
-        if self.laminate and (self.viscosity is not None or self.relaxation):
-            raise ValueError("laminate: has no viscosity and no relaxation: these are of one isotropic material")
         return self
 
     @classmethod

@@ -16,7 +16,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.carriers import Carrier, HeldEdge
-from magshell_fenicsx.models.shell import edges
+from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.law import Law, work
@@ -235,9 +235,9 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     factory, carrier, field = model.factory, model.factory.carrier, given.field
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
 
-    def law(side: str = "") -> Law:
+    def law(j: Jet, side: str = "") -> Law:
         """That of the shell at small strains, which a viscous stress follows too."""
-        of_shell = model.material.law.linear
+        of_shell = densities.law_at(model.material.law.linear, j)
         return of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
 
     def viscous(j: Jet, side: str = "") -> tuple[Expr, Expr]:
@@ -251,8 +251,10 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     E, K = strained(r0, u)
     strain, bend = viscous(r0)
     up = kin.inverse_metric(r0)
-    stretching, bending = work(law().stress(strain, up), E), work(law().moment(strain, bend, up), K)
-    works = [(stretching + bending) * kin.area_ratio(r0) * carrier.dx()]
+    own = law(r0)
+    stretching, bending = work(own.stress(strain, up), E), work(own.moment(strain, bend, up), K)
+    coupled = work(own.moment(E, 0 * K, up), bend)  # of plies: what a viscous bend pulls
+    works = [(stretching + bending + coupled) * kin.area_ratio(r0) * carrier.dx()]
 
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
@@ -267,17 +269,17 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     given_moment, bent, stiff = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
         edge = kin.inverse_metric(j), (nu1, nu2), 1
-        given_moment += law(side).edge_moment(*viscous(j, side), *edge) / 2
-        bent += law(side).edge_moment(*strained(j, v), *edge) / 2
-        stiff += law(side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
+        given_moment += law(j, side).edge_moment(*viscous(j, side), *edge) / 2
+        bent += law(j, side).edge_moment(*strained(j, v), *edge) / 2
+        stiff += law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
     S_J, J = given.opened(carrier, across), across(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * carrier.dS()
 
     nu1, nu2, stretch = kin.conormal(r0, m)
     edge = up, (nu1, nu2), 1
-    M, bent = (law().edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
-    stiff = law().edge_stiffness(E, *edge) * model.sigma / carrier.widths[1]
+    M, bent = (own.edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
+    stiff = own.edge_stiffness(E, *edge) * model.sigma / carrier.widths[1]
     for held_edge in factory.held:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
         S_J, J = given.opened(carrier, jump), jump(r0 + u)

@@ -122,7 +122,6 @@ def test_what_is_refused() -> None:
         "along: a vector of length zero is no direction": {"laminate": {"plies": plies(0), "along": [0.0, 0.0, 0.0]}},
         "give each of E1, E2, G12 a unit, or none": {"laminate": {"plies": [plies(0)[0] | {"E1": "3 GPa"}]}},
         "laminate: needs law: koiter": {"laminate": {"plies": plies(0)}, "law": "neo-hookean", "poisson_ratio": 0.5},
-        "laminate: has no viscosity and no relaxation": {"laminate": {"plies": plies(0)}, "viscosity": 0.1},
     }
     for message, keys in wrong.items():
         with pytest.raises(CaseError, match=message.replace("^", r"\^")):

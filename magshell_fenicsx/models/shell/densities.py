@@ -23,7 +23,7 @@ MagneticDensity = Callable[..., Expr]  # of (r0, u, Br, Ba), and the natural for
 
 def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
     """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural` forms."""
-    E, law = kin.membrane_strain(r0, u), _at(law, r0)
+    E, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
         return law.membrane(E, kin.inverse_metric(r0))
     return natural.area * law.thicker(natural.thickness).membrane(E - natural.strain, natural.up)
@@ -32,7 +32,7 @@ def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr
 def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
     """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to S: what that adds to the energy of v."""
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
-    present, law = kin.membrane_strain(r0, u), _at(law, r0)
+    present, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
         return work(law.stress_change(present, strain, kin.inverse_metric(r0)), kin.metric(v)) / 2
     law = law.thicker(natural.thickness)
@@ -41,7 +41,7 @@ def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | No
 
 def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
     """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
-    E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), _at(law, r0)
+    E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         return law.bending(E, K, kin.inverse_metric(r0))
     return natural.area * law.thicker(natural.thickness).bending(E - natural.strain, K - natural.bend, natural.up)
@@ -49,7 +49,7 @@ def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
 
 def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None) -> tuple[Expr, Expr]:
     """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a penalty."""
-    E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), _at(law, r0)
+    E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         edge = kin.inverse_metric(r0), (nu1, nu2), 1
         return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
@@ -60,7 +60,8 @@ def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Form
     return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, *edge)
 
 
-def _at(law: Law, r0: Jet) -> Law:
+def law_at(law: Law, r0: Jet) -> Law:
+    """That of a place: of directions."""
     return law.at(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
 
 

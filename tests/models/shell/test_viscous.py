@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from along import csr
+from plies import ply, section
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, follow
@@ -47,6 +48,38 @@ def test_damped_vibration(shell: dict[str, Any], polynomial: list[float]) -> Non
     energy = (found["kinetic"] + found["stored"] + found["dissipated"])[1:]
     assert np.ptp(energy) < 1e-7 * energy[0]
     assert found["dissipated"][-1] > 0.1 * energy[0]
+
+
+COUPLED = {"plies": [ply(0, 3.0, 0.5, nu12=0.0), ply(90, 3.0, 0.5, nu12=0.0)]}
+
+
+def test_damped_vibration_of_plies() -> None:
+    """A cantilever of [0/90]: an oscillator with the stiffness D11 - B11^2/A11 of lamination theory."""
+    A, B, D = section(*COUPLED["plies"]).matrices(1.0)[:, 0]
+    omega = OMEGA * float(np.sqrt(12 * (D - B**2 / A)))
+    period, push = 2 * np.pi / omega, {"mode": 1, "displacement": 0.01}
+    step = {"duration": period, "points": 8, "step": period / 80, "rho_inf": 1.0, "push": push}
+    shell = {"laminate": COUPLED, "viscosity": 0.1 / omega, "relaxation": [{"modulus": 0.3, "time": 1 / omega}]}
+    scene = Scene(case_of(shell, step))
+    found = columns(scene, follow(scene))
+    damped = exact([1, 1.1, 1.4, 1], omega * found["time"][1:])  # (s^2 + 0.1 s + 1)(s + 1) + 0.3 s
+    assert found["w_over_h"][1:] / 0.01 == pytest.approx(damped, abs=2e-3)
+    energy = (found["kinetic"] + found["stored"] + found["dissipated"])[1:]
+    assert np.ptp(energy) < 1e-6 * energy[0]
+
+
+def test_viscous_plies_are_as_stiff() -> None:
+    """Of a thickness that varies; the forces of a smooth velocity are those of the elastic tangent."""
+    plies = [ply(20, 3.0, 0.3), ply(-70, 0.7, 0.7)]
+    shell = {"laminate": {"along": [0.3, 1.0, 0.0], "plies": plies}, "thickness_factor": "1 + x/2", "viscosity": 2.0}
+    scene = Scene(case_of(shell, {"duration": 1.0}, symmetry="none"))
+    model, u = scene.model, np.zeros(scene.model.system.size)
+    x, y, _ = model.r0.x.array.reshape(-1, 3).T
+    v = np.column_stack([x * y, x**2 - x * y, x**2 * (1 + y)]).ravel()
+    elastic = csr(model.system.tangent(u, {})) @ v
+    free = np.flatnonzero(model.system.held(np.ones(v.size)))
+    force = Viscosity(model, {}, 2.0, []).force(u, u, v, 1.0, 0.0)  # type: ignore[arg-type]
+    assert force[free] == pytest.approx(2 * elastic[free], abs=1e-5 * np.abs(elastic).max())
 
 
 def test_creep() -> None:
