@@ -156,6 +156,8 @@ class Charged:
                 there = (rows[0] >= 0) & (rows[1] >= 0)
                 left, right = ((kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True))
                 energy += part * self._pairs.add(nodes, both[there], int(there.sum()), left, right, gradient, stiffness)
+        for number, kind in product(np.unique(which), self._kinds):
+            self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:
             energy += self._near.add(nodes, gradient, stiffness)
         if stiffness:

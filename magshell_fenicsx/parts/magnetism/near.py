@@ -33,7 +33,6 @@ from magshell_fenicsx.parts.magnetism.touching import (
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-ORDER = np.array([0.5377, 0.8339, -0.2588])  # of two cells the first one is that which is less far along it
 NOTHING = 1e-13  # of the largest charge: elements without any
 CHUNK = 40_000  # points at which charges are found at once
 ON_STRIP = (8, 4)  # nodes along and across a strip at which charges are found; between them they are polynomials
@@ -117,15 +116,12 @@ class Near:
                 meeting.setdefault(each, []).append(cell)
         self.touching = [sorted({other for each in three for other in meeting[each]}) for three in numbers]
         self._free = self._at_boundary()
-        place = shape.r0[:, :3].sum(axis=1) @ ORDER
         kinds: dict[Kind, list[tuple[int, int]]] = {}
         for c, others in enumerate(self.touching):
             for d in others:
-                first = (round(place[c], 9), c) <= (round(place[d], 9), d)
                 if c in own or d in own:
                     for kind in self._kinds(c, d):
-                        if first or kind[0] == "strip":
-                            kinds.setdefault(kind, []).append((c, d))
+                        kinds.setdefault(kind, []).append((c, d))
         self._most = 0.0
         self._batches = list(self._charged(kinds))
 
@@ -136,6 +132,9 @@ class Near:
             every = np.arange(len(each.pairs))
             left, right = (each.left, every), (each.right, every)
             energy += self._pairs.add(nodes, each.pairs, each.own, left, right, gradient, stiffness)
+            self._pairs.finish(nodes, each.pairs[:, 0], each.left, gradient, stiffness)
+            if each.right.tables.ndim == 3:
+                self._pairs.finish(nodes, each.pairs[:, 1], each.right, gradient, stiffness)
         return energy
 
     def _at_boundary(self) -> NDArray[np.bool_]:
@@ -213,8 +212,7 @@ class Near:
                 t.reshape(len(t), count, -1),
                 q.reshape(len(q), count, -1, h.shape[-1]),
             )
-        twice = (pairs[:, 0] == pairs[:, 1]) & (kind[0] != "strip")
-        share = np.where(twice, 0.5, 1.0)[:, None, None]
+        share = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
         return Batch(pairs, own, Points(left[0], left[1], left[2], share * left[3]), Points(T, h, t, q))
 
     def _rules(self, kind: Kind) -> tuple[Places, Places, bool]:

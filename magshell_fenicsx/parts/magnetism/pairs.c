@@ -5,6 +5,7 @@
 #include <string.h>
 
 #define LANES 8
+#define SUMS 24
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -17,7 +18,7 @@ typedef int64_t whole __attribute__((vector_size(8 * LANES)));
 
 typedef struct {
     v r[3], n[3], up[2][3];  /* place, normal and dual basis */
-    v F[3], W[3];            /* the derivative by r, and its moment by t eta */
+    v F[3], W[3];            /* SUMS numbers: the derivative by r, and its moment by t eta, */
     v K[3][6];               /* second derivatives by r, and their first and second moment: xx, yy, zz, xy, xz, yz */
     v t;
 } Point;
@@ -119,33 +120,101 @@ INLINE void gather(const double *x, int64_t step, const int64_t *at, v *y)
         (*y)[c] = x[step * at[c]];
 }
 
+/* The energy of the charges q (L,) at one point and p (S,) at another, at heights hL and hR over the thickness; the derivatives of
+   both are added up, and if `bent` the second ones, too. X (4, 6) gets those by both places, and their moments by the
+   left height, the right one, and both. */
+INLINE void between(int64_t L, int64_t S, int bent, Point *left, const v *q, const double *hL, Point *right, const v *p,
+                    const double *hR, v *energy, v *X)
+{
+    v apart[3], F[3], W[3], sum;
+    memset(F, 0, sizeof F), memset(W, 0, sizeof W), memset(&sum, 0, sizeof sum);
+    if (bent)
+        memset(X, 0, 24 * sizeof *X);
+    for (int i = 0; i < 3; ++i)
+        apart[i] = left->r[i] - right->r[i];
+    for (int64_t l = 0; l < L; ++l) {
+        const v z = left->t * hL[l];
+        v from[3], f[3], h[2][6];
+        memset(f, 0, sizeof f), memset(h, 0, sizeof h);
+        for (int i = 0; i < 3; ++i)
+            from[i] = apart[i] + z * left->n[i];
+        for (int64_t s = 0; s < S; ++s) {
+            const v y = right->t * hR[s];
+            v d[3], root;
+            for (int i = 0; i < 3; ++i)
+                d[i] = from[i] - y * right->n[i];
+            const v square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            inverse_root(&square, &root);
+            const v value = q[l] * p[s] * root, inverse = root * root, slope = value * inverse;
+            sum += value;
+            for (int i = 0; i < 3; ++i) {
+                const v g = slope * d[i];
+                f[i] -= g, W[i] += y * g;
+            }
+            if (!bent)
+                continue;
+            const v bend = 3.0 * slope * inverse;
+            const v each[6] = {bend * d[0] * d[0] - slope, bend * d[1] * d[1] - slope, bend * d[2] * d[2] - slope,
+                               bend * d[0] * d[1],         bend * d[0] * d[2],         bend * d[1] * d[2]};
+            for (int i = 0; i < 6; ++i) {
+                const v moment = y * each[i];
+                h[0][i] += each[i], h[1][i] += moment, right->K[2][i] += y * moment;
+            }
+        }
+        for (int i = 0; i < 3; ++i)
+            F[i] += f[i], left->W[i] += z * f[i];
+        for (int i = 0; i < 6 && bent; ++i) {
+            const v first = z * h[0][i];
+            left->K[1][i] += first, left->K[2][i] += z * first;
+            X[i] += h[0][i], X[6 + i] += first, X[12 + i] += h[1][i], X[18 + i] += z * h[1][i];
+        }
+    }
+    *energy += sum;
+    for (int i = 0; i < 3; ++i)
+        left->F[i] += F[i], right->F[i] -= F[i], right->W[i] += W[i];
+    for (int i = 0; i < 6 && bent; ++i)
+        left->K[0][i] += X[i], right->K[0][i] += X[i], right->K[1][i] += X[12 + i];
+}
+
+/* Add the derivatives of a point of LANES elements to the sums of those (.., SUMS), `step` apart; `idle` ones are left out. */
+INLINE void sum_up(const Point *p, int bent, int64_t idle, const int64_t *at, int64_t step, double *sums)
+{
+    const v *each = p->F;
+    for (int c = 0; c < LANES - idle; ++c)
+        for (int i = 0; i < (bent ? SUMS : 6); ++i)
+            sums[step * at[c] + i] += each[i][c];
+}
+
 /* The energy of the first `counted` of `count` pairs of cells (count, 2), a multiple of LANES of which the last `idle`
    are none; nodes (cells, k, 3). On the first of each pair are P points with the tables TL (P, 3, k), heights hL (P, L),
-   thickness tL (rows, P) and charges qL (rows, P, L), in the row eL (count,). On the second are M points for each of
-   these, TR (P, M, 3, k), hR (P, M, S), tR (rows, P, M), qR (rows, P, M, S), eR, or `same` ones for all: without the
-   axis P. gradient (cells, k, 3) is added to. Unless NULL, so is `onto` (cells, a <= b, 3, 3), the second derivatives by
-   the nodes of one cell, times `factor`; and those by both cells' to rows (.., 3, columns, 3), in the row row_of (cells, k)
-   if that is not negative, and the column column_of (cells, k). */
+   thickness tL (rows, P) and charges qL (rows, P, L), in the row eL (count,); the derivatives at its points are added to
+   sL (rows, P, SUMS). On the second are M points for each of these, TR (P, M, 3, k), hR (P, M, S), tR (rows, P, M),
+   qR (rows, P, M, S), eR; their derivatives are added to gradient (cells, k, 3) and `onto`, see `own`. Or `same` ones
+   for all: without the axis P, and added to sR (rows, M, SUMS). Unless `onto` is NULL, second derivatives by the nodes of
+   both cells times `factor` are added to rows (.., 3, columns, 3), in the row row_of (cells, k) if that is not negative,
+   and the column column_of (cells, k). */
 FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *both, int64_t nodes_of_cell,
                   const double *nodes, int64_t P, int64_t L, const double *TL, const double *hL, const double *tL,
-                  const double *qL, const int64_t *eL, int64_t M, int64_t S, const double *TR, const double *hR,
-                  const double *tR, const double *qR, const int64_t *eR, int64_t same, double *gradient, double factor,
-                  double *onto, double *rows, int64_t columns, const int64_t *row_of, const int64_t *column_of)
+                  const double *qL, double *sL, const int64_t *eL, int64_t M, int64_t S, const double *TR,
+                  const double *hR, const double *tR, const double *qR, double *sR, const int64_t *eR, int64_t same,
+                  double *gradient, double factor, double *onto, double *rows, int64_t columns, const int64_t *row_of,
+                  const int64_t *column_of)
 {
-    const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2;
+    const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2, bent = onto != 0;
     const int64_t all = same ? M : P * M;
     double energy = 0.0;
     Point points[same ? M : 1];
-    v QR[same ? M * S : S], XL[3 * k], XR[3 * k], GL[3 * k], GR[3 * k], A[9 * k], B[9 * k], C[2][3 * k];
-    v HL[onto ? half : 1], HR[onto ? half : 1], HX[onto ? 9 * k * k : 1];
+    v QR[same ? M * S : S], XL[3 * k], XR[3 * k], GR[3 * k], A[9 * k], B[9 * k], C[2][3 * k];
+    v HR[bent && !same ? half : 1], HX[bent ? 9 * k * k : 1];
     for (int64_t at = 0; at < count; at += LANES) {
         v sum, live, q[L];
-        memset(&sum, 0, sizeof sum), memset(GL, 0, sizeof GL), memset(GR, 0, sizeof GR);
-        memset(HL, 0, sizeof HL), memset(HR, 0, sizeof HR), memset(HX, 0, sizeof HX);
+        memset(&sum, 0, sizeof sum), memset(GR, 0, sizeof GR);
+        memset(HR, 0, sizeof HR), memset(HX, 0, sizeof HX);
         int64_t left_cell[LANES], right_cell[LANES];
+        const int64_t none = at + LANES == count ? idle : 0;
         for (int c = 0; c < LANES; ++c) {
             left_cell[c] = both[2 * (at + c)], right_cell[c] = both[2 * (at + c) + 1];
-            live[c] = at + c < count - idle ? 1.0 : 0.0;
+            live[c] = c < LANES - none ? 1.0 : 0.0;
         }
         for (int l = 0; l < 3 * k; ++l)
             gather(nodes + l, 3 * k, left_cell, XL + l), gather(nodes + l, 3 * k, right_cell, XR + l);
@@ -164,71 +233,47 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                 gather(qL + p * L + l, P * L, eL + at, q + l);
                 q[l] *= live;
             }
-            if (onto)
+            if (bent)
                 memset(A, 0, sizeof A), memset(B, 0, sizeof B);
             for (int64_t m = 0; m < M; ++m) {
                 const int64_t row = same ? m : p * M + m;
-                Point *other = same ? points + m : points;
-                v *charges = same ? QR + m * S : QR;
+                Point *right = same ? points + m : points;
+                v *charges = same ? QR + m * S : QR, X[24];
+                const double *T = TR + row * 3 * k, *from = hL + p * L, *to = hR + row * S;
                 if (!same) {
-                    place(k, TR + row * 3 * k, XR, other);
-                    gather(tR + row, all, eR + at, &other->t);
+                    place(k, T, XR, right);
+                    gather(tR + row, all, eR + at, &right->t);
                     for (int64_t s = 0; s < S; ++s)
                         gather(qR + row * S + s, all * S, eR + at, charges + s);
                 }
-                v X[4][6]; /* second derivatives, with moments by none, the left, the right, both heights */
-                memset(X, 0, sizeof X);
-                for (int64_t l = 0; l < L; ++l)
-                    for (int64_t s = 0; s < S; ++s) {
-                        const v z = left.t * hL[p * L + l], y = other->t * hR[row * S + s];
-                        v d[3], root;
-                        for (int i = 0; i < 3; ++i)
-                            d[i] = left.r[i] + z * left.n[i] - other->r[i] - y * other->n[i];
-                        const v square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-                        inverse_root(&square, &root);
-                        const v value = q[l] * charges[s] * root, inverse = root * root, slope = value * inverse;
-                        sum += value;
-                        for (int i = 0; i < 3; ++i) {
-                            const v f = -slope * d[i];
-                            left.F[i] += f, left.W[i] += z * f;
-                            other->F[i] -= f, other->W[i] -= y * f;
-                        }
-                        if (!onto)
-                            continue;
-                        const v bend = 3.0 * slope * inverse;
-                        const v h[6] = {bend * d[0] * d[0] - slope, bend * d[1] * d[1] - slope,
-                                        bend * d[2] * d[2] - slope, bend * d[0] * d[1],
-                                        bend * d[0] * d[2],         bend * d[1] * d[2]};
-                        for (int i = 0; i < 6; ++i) {
-                            const v zh = z * h[i], yh = y * h[i];
-                            left.K[0][i] += h[i], left.K[1][i] += zh, left.K[2][i] += z * zh;
-                            other->K[0][i] += h[i], other->K[1][i] += yh, other->K[2][i] += y * yh;
-                            X[0][i] += h[i], X[1][i] += zh, X[2][i] += yh, X[3][i] += z * yh;
-                        }
-                    }
-                const double *T = TR + row * 3 * k;
+                if (L == 2 && S == 2 && !bent)
+                    between(2, 2, 0, &left, q, from, right, charges, to, &sum, X);
+                else if (L == 2 && S == 2)
+                    between(2, 2, 1, &left, q, from, right, charges, to, &sum, X);
+                else
+                    between(L, S, bent, &left, q, from, right, charges, to, &sum, X);
                 if (!same)
-                    own(k, T, other, GR, onto ? HR : 0);
-                if (!onto)
+                    own(k, T, right, GR, bent ? HR : 0);
+                if (!bent)
                     continue;
                 v a[2][3], b[2][3];
                 for (int e = 0; e < 2; ++e)
-                    times(X[2], other->up[e], a[e]), times(X[3], other->up[e], b[e]);
+                    times(X + 12, right->up[e], a[e]), times(X + 18, right->up[e], b[e]);
                 for (int i = 0; i < 3; ++i)
                     for (int j = 0; j < 3; ++j) {
-                        const v n = other->n[j], a0 = X[0][AT[i][j]], a1 = a[0][i] * n, a2 = a[1][i] * n;
-                        const v b0 = X[1][AT[i][j]], b1 = b[0][i] * n, b2 = b[1][i] * n;
-                        v *to = A + (3 * i + j) * k, *too = B + (3 * i + j) * k;
+                        const v n = right->n[j], a0 = X[AT[i][j]], a1 = a[0][i] * n, a2 = a[1][i] * n;
+                        const v b0 = X[6 + AT[i][j]], b1 = b[0][i] * n, b2 = b[1][i] * n;
+                        v *one = A + (3 * i + j) * k, *other = B + (3 * i + j) * k;
                         for (int l = 0; l < k; ++l) {
-                            to[l] += a0 * T[l] - a1 * T[k + l] - a2 * T[2 * k + l];
-                            too[l] += b0 * T[l] - b1 * T[k + l] - b2 * T[2 * k + l];
+                            one[l] += a0 * T[l] - a1 * T[k + l] - a2 * T[2 * k + l];
+                            other[l] += b0 * T[l] - b1 * T[k + l] - b2 * T[2 * k + l];
                         }
                     }
             }
-            const double *T = TL + p * 3 * k;
-            own(k, T, &left, GL, onto ? HL : 0);
-            if (!onto)
+            sum_up(&left, bent, none, eL + at, P * SUMS, sL + p * SUMS);
+            if (!bent)
                 continue;
+            const double *T = TL + p * 3 * k;
             for (int e = 0; e < 2; ++e)
                 for (int l = 0; l < 3 * k; ++l)
                     C[e][l] = left.up[e][0] * B[l] + left.up[e][1] * B[3 * k + l] + left.up[e][2] * B[6 * k + l];
@@ -240,21 +285,17 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                 }
         }
         for (int64_t m = 0; m < M && same; ++m)
-            own(k, TR + m * 3 * k, points + m, GR, onto ? HR : 0);
-        for (int c = 0; c < LANES && at + c < count - idle; ++c) {
-            double *to = gradient + 3 * k * left_cell[c], *too = gradient + 3 * k * right_cell[c];
+            sum_up(points + m, bent, none, eR + at, M * SUMS, sR + m * SUMS);
+        for (int c = 0; c < LANES - none; ++c) {
             energy += at + c < counted ? sum[c] : 0.0;
-            for (int l = 0; l < 3 * k; ++l)
-                to[l] += GL[l][c];
-            for (int l = 0; l < 3 * k; ++l)
-                too[l] += GR[l][c];
-            if (!onto)
+            double *to = gradient + 3 * k * right_cell[c];
+            for (int l = 0; l < 3 * k && !same; ++l)
+                to[l] += GR[l][c];
+            if (!bent)
                 continue;
-            to = onto + half * left_cell[c], too = onto + half * right_cell[c];
-            for (int l = 0; l < half; ++l)
-                to[l] += factor * HL[l][c];
-            for (int l = 0; l < half; ++l)
-                too[l] += factor * HR[l][c];
+            to = onto + half * right_cell[c];
+            for (int l = 0; l < half && !same; ++l)
+                to[l] += HR[l][c];
             for (int l = 0; l < k; ++l)
                 for (int m = 0; m < k; ++m) {
                     const int64_t a = row_of[k * left_cell[c] + l], b = row_of[k * right_cell[c] + m];
@@ -271,6 +312,38 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
         }
     }
     return energy;
+}
+
+/* What sums (count, P, SUMS) of derivatives at points of elements in cells (count,) add to gradient (cells, k, 3) and,
+   unless NULL, to `onto` (cells, a <= b, 3, 3); count is a multiple of LANES, the last `idle` are none. */
+FAST void points(int64_t count, int64_t idle, const int64_t *cells, int64_t nodes_of_cell, const double *nodes, int64_t P,
+                 const double *T, const double *sums, double *gradient, double *onto)
+{
+    const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2;
+    v X[3 * k], G[3 * k], H[onto ? half : 1];
+    for (int64_t at = 0; at < count; at += LANES) {
+        int64_t of[LANES];
+        const int64_t none = at + LANES == count ? idle : 0;
+        for (int c = 0; c < LANES; ++c)
+            of[c] = c < LANES - none ? at + c : at;
+        for (int l = 0; l < 3 * k; ++l)
+            gather(nodes + l, 3 * k, cells + at, X + l);
+        memset(G, 0, sizeof G), memset(H, 0, sizeof H);
+        for (int64_t p = 0; p < P; ++p) {
+            Point point;
+            place(k, T + p * 3 * k, X, &point);
+            v *each = point.F;
+            for (int i = 0; i < (onto ? SUMS : 6); ++i)
+                gather(sums + p * SUMS + i, P * SUMS, of, each + i);
+            own(k, T + p * 3 * k, &point, G, onto ? H : 0);
+        }
+        for (int c = 0; c < LANES - none; ++c) {
+            for (int l = 0; l < 3 * k; ++l)
+                gradient[3 * k * cells[at + c] + l] += G[l][c];
+            for (int l = 0; l < half && onto; ++l)
+                onto[half * cells[at + c] + l] += H[l][c];
+        }
+    }
 }
 
 /* The number of the rule of each pair of a cell from `first` to `last` with any of n, where `apart` (own, n) is not 0; -1

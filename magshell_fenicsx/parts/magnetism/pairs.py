@@ -13,12 +13,14 @@ from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-LANES = 8  # as in pairs.c
+LANES, SUMS = 8, 24  # as in pairs.c
 FUNCTIONS = """
     double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *,
-        const double *, const double *, const double *, const int64_t *, int64_t, int64_t, const double *,
-        const double *, const double *, const double *, const int64_t *, int64_t, double *, double, double *, double *,
-        int64_t, const int64_t *, const int64_t *);
+        const double *, const double *, const double *, double *, const int64_t *, int64_t, int64_t, const double *,
+        const double *, const double *, const double *, double *, const int64_t *, int64_t, double *, double, double *,
+        double *, int64_t, const int64_t *, const int64_t *);
+    void points(int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, const double *, const double *,
+        double *, double *);
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
         const uint8_t *, double, double, double, int64_t, const double *, double, int8_t *);
 """
@@ -52,6 +54,11 @@ class Points:
         for name, value in vars(self).items():
             object.__setattr__(self, name, np.ascontiguousarray(value))
 
+    @cached_property
+    def sums(self) -> Array:
+        """(rows, P, SUMS) derivatives at points that stay on their elements; zero between evaluations."""
+        return np.zeros((*self.t.shape, SUMS))
+
 
 class Stiffness:
     """Second derivatives: those by the nodes of one cell, summed, and rows of a matrix.
@@ -78,7 +85,8 @@ class Stiffness:
         own = np.flatnonzero(self.row_of[:, 0] >= 0)
         block = np.zeros((k, k, 3, 3))
         for cell in own:
-            block[b, a], block[a, b] = self.onto[cell].transpose(0, 2, 1), self.onto[cell]
+            onto = self.factor * self.onto[cell]
+            block[b, a], block[a, b] = onto.transpose(0, 2, 1), onto
             at = self.row_of[cell][:, None], slice(None), self.column_of[cell][None], slice(None)
             self.rows[at] += block
 
@@ -94,12 +102,14 @@ class Pairs:
         nodes: Array,
         cells: Ints,
         counted: int,
-        left: tuple[Points, Ints],
-        right: tuple[Points, Ints],
+        left: tuple["Points", Ints],
+        right: tuple["Points", Ints],
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
         """The energy of the first pairs of cells (n, 2); the gradient (cells, k, 3) and the stiffness of all are added.
+
+        What they add at points that stay on their elements is in the sums of these: see `finish`.
 
         Parameters
         ----------
@@ -109,7 +119,7 @@ class Pairs:
         if not len(cells):
             return 0.0
         idle = -len(cells) % LANES
-        both, first, second = (np.concatenate([each, each[-1:].repeat(idle, 0)]) for each in (cells, left[1], right[1]))
+        both, first, second = (_filled(each, idle) for each in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
         into = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL]
@@ -119,8 +129,20 @@ class Pairs:
         one, other = ([p(each.tables), p(each.heights), p(each.t), p(each.q)] for each in (left[0], right[0]))
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
         factor = stiffness.factor if stiffness else 0.0
-        seen = [P, L, *one, p(first), M, S, *other, p(second), int(same), p(gradient), factor]
+        sums = p(right[0].sums) if same else self._ffi.NULL
+        seen = [P, L, *one, p(left[0].sums), p(first), M, S, *other, sums, p(second), int(same), p(gradient), factor]
         return float(self._lib.pairs(*sizes, *seen, *into))
+
+    def finish(
+        self, nodes: Array, cells: Ints, of: "Points", gradient: Array, stiffness: Stiffness | None = None
+    ) -> None:
+        """Add the sums at points on elements in cells (rows,), which are zero again."""
+        idle, p = -len(cells) % LANES, self._pointer
+        every = _filled(cells, idle)
+        onto = p(stiffness.onto) if stiffness else self._ffi.NULL
+        given = [len(every), idle, p(every), nodes.shape[1], p(nodes), of.tables.shape[0], p(of.tables), p(of.sums)]
+        self._lib.points(*given, p(gradient), onto)
+        of.sums[:] = 0.0
 
     def rules(self, nodes: Array, own: range, apart: NDArray[np.uint8], least: Array, *numbers: float) -> Any:
         """See pairs.c; None if two cells are too near each other."""
@@ -139,3 +161,8 @@ class Pairs:
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
         return self._ffi.from_buffer(KINDS[array.dtype], array)
+
+
+def _filled(each: Ints, idle: int) -> Ints:
+    """Rows with some more of the last one."""
+    return np.concatenate([each, each[-1:].repeat(idle, 0)])
