@@ -69,19 +69,23 @@ class WholeMatrix:
     def sum(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]]) -> PETSc.Mat:
         """A sparse matrix plus terms times factors. Collective."""
         n, first = 3 * self._owned, 3 * self._first
-        rows = self._own(self.rows(terms)).reshape(n, 3 * self._count)
+        alone = self._comm.size == 1
+        into = self._inner.reshape(self._owned, 3, self._count, 3) if alone else None  # nothing is copied
+        rows = self._own(self.rows(terms, into)).reshape(n, 3 * self._count)
         here, everywhere = self._held
         rows[here], rows[:, everywhere] = 0.0, 0.0
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
-        self._inner[:] = rows[:, first : first + n]
-        self._outer[:] = np.delete(rows, np.s_[first : first + n], axis=1) if self._outer.size else 0.0
+        if not alone:
+            self._inner[:] = rows[:, first : first + n]
+            self._outer[:] = np.delete(rows, np.s_[first : first + n], axis=1)
         self._K.stateIncrease()
         return self._K
 
-    def rows(self, terms: Sequence[tuple[float, WholeTerm]]) -> Array:
-        """This rank's part of the rows of its nodes, ghosts too, see `WholeTerm`. Collective."""
-        rows = np.zeros((self._owned + self._ghosts, 3, self._count, 3))
+    def rows(self, terms: Sequence[tuple[float, WholeTerm]], into: Array | None = None) -> Array:
+        """This rank's part of the rows of its nodes, ghosts too, see `WholeTerm`; in an array if given. Collective."""
+        rows = np.empty((self._owned + self._ghosts, 3, self._count, 3)) if into is None else into
+        rows[:] = 0.0
         for factor, term in terms:
             term.add_rows(rows, factor)
         return rows

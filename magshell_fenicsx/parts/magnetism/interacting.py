@@ -8,7 +8,6 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from scipy.sparse import coo_array
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
 from magshell_fenicsx.input.source import CaseError
@@ -17,6 +16,7 @@ from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
+from magshell_fenicsx.parts.magnetism.pairs import Stiffness
 from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
@@ -46,9 +46,6 @@ class InteractionTerm:
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
         self._cells = CellsOfAll.of(V)
-        nodes = self._cells.nodes
-        ones = np.ones(nodes.size), (nodes.ravel(), np.arange(nodes.size))
-        self._to_nodes = coo_array(ones, (V.dofmap.index_map.size_global, nodes.size)).tocsr()  # from those of cells
         self._parts = self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]])  # of each cell
         unknowns = 3 * V.dofmap.index_map.size_global
         if not of.itself and self._parts.max() == 0:
@@ -103,31 +100,13 @@ class InteractionTerm:
 
     def add_rows(self, rows: Array, factor: float) -> None:
         """See `assembly.whole.WholeTerm`; collective."""
-        nodes = self._nodes()
-        local = self._u.function_space.dofmap.list[: len(self._cells.own)]
-        k = self._cells.nodes.shape[1]
-
-        def add(row: int, stiffness: Array) -> None:
-            flat = stiffness.reshape(3 * k, -1, 3).transpose(1, 0, 2).reshape(-1, 9 * k)
-            summed = (self._to_nodes @ flat).reshape(-1, k, 3, 3).transpose(1, 2, 0, 3)
-            rows[local[row]] += factor * self._scale * summed
-
+        own, row_of = self._cells.own, np.full(self._cells.nodes.shape, -1)
+        row_of[own.start : own.stop] = self._u.function_space.dofmap.list[: len(own)]
+        stiffness = Stiffness(rows, factor * self._scale, row_of, np.ascontiguousarray(self._cells.nodes, np.int64))
         try:
-            self._charged.evaluate(nodes, self._cells.own, add)
+            self._charged.evaluate(self._nodes(), own, stiffness)
         except Touching:
             rows[:] = np.nan
-        if self._near:
-            self._add_near(nodes, rows, factor * self._scale)
-
-    def _add_near(self, nodes_of_cells: Array, rows: Array, factor: float) -> None:
-        """What cells that touch add to the rows of nodes of own cells."""
-        assert self._near
-        own, local, nodes = self._cells.own, self._u.function_space.dofmap.list, self._cells.nodes
-        for first, second, H in self._near.stiffness(nodes_of_cells):
-            for i, (c, d) in enumerate(zip(first, second, strict=True)):
-                if c in own:
-                    at = local[c - own.start][:, None], slice(None), nodes[d], slice(None)
-                    rows[at] += factor * H[i].transpose(1, 3, 0, 2)
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""

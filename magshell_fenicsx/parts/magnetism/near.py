@@ -8,7 +8,6 @@ are others than far away (`touching`), the same for all pairs of one kind.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import basix
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.touching import (
     APART,
     ENDS,
@@ -30,7 +30,6 @@ from magshell_fenicsx.parts.magnetism.touching import (
     polar,
     strip,
 )
-from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,16 +43,11 @@ NODES = basix.create_element(
     lagrange_variant=basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
-FUNCTIONS = """
-    double near(int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *, const double *,
-        const double *, const double *, int64_t, int64_t, const double *, const double *, const double *,
-        const double *, int64_t, double *, double *);
-"""
 Kind = tuple[Any, ...]  # of a pair of elements: the first one with its sides, the second, and where they touch
 
 
 @dataclass(frozen=True)
-class Points:
+class Places:
     """Points of elements of one kind.
 
     Attributes
@@ -71,28 +65,24 @@ class Points:
     at: Array | None = None
 
     @classmethod
-    def of_strip(cls, edge: int, t: Array, eta: Array, weights: Array) -> "Points":
+    def of_strip(cls, edge: int, t: Array, eta: Array, weights: Array) -> "Places":
         return cls(on_edge(edge, t), weights, np.column_stack([t, eta]))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Pairs of one kind, with what `near.c` takes.
+    """Pairs of cells with elements of one kind each.
 
     Attributes
     ----------
-    factor
-        1/2 where the pair stands in both orders.
     own
         How many of the first pairs have their first cell on this rank.
     """
 
     pairs: Ints
-    factor: float
     own: int
-    left: tuple[Array, ...]
-    right: tuple[Array, ...]
-    same: bool
+    left: Points
+    right: Points
 
 
 class Near:
@@ -111,7 +101,7 @@ class Near:
     """
 
     def __init__(self, shape: Shape, corners: Ints, cells: Ints, edges: Ints, own: range, comm: MPI.Comm) -> None:
-        self._ffi, self._lib = native(Path(__file__).with_name("near.c"), FUNCTIONS, comm)
+        self._pairs = Pairs(comm)
         self._shape, self._corners, self._own = shape, corners, own
         strips = np.zeros((len(corners), 3), dtype=bool)
         strips[cells, edges] = True
@@ -135,42 +125,17 @@ class Near:
         self._most = 0.0
         self._batches = list(self._charged(kinds))
 
-    def add(self, nodes: Array, gradient: Array) -> float:
+    def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
         """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added, right for own cells."""
-        return sum(self._evaluate(each, nodes, gradient, None) for each in self._batches)
-
-    def stiffness(self, nodes: Array) -> Iterator[tuple[Ints, Ints, Array]]:
-        """Rows and columns (n,) of cells, and (n, 3, k, 3, k) second derivatives: the component before the node."""
-        k, unused = nodes.shape[1], np.zeros_like(nodes)
-        for each in self._batches:
-            H = np.zeros((len(each.pairs), 3, 3, k, 3, k))
-            self._evaluate(each, nodes, unused, H)
-            c, d = each.pairs.T
-            cross = each.factor * H[:, 1]
-            yield c, c, each.factor * H[:, 0]
-            yield d, d, each.factor * H[:, 2]
-            yield c, d, cross
-            yield d, c, cross.transpose(0, 3, 4, 1, 2)
-
-    def _evaluate(self, batch: Batch, nodes: Array, gradient: Array, H: Array | None) -> float:
-        slope = np.zeros_like(gradient)
         energy = 0.0
-        for part in (slice(0, batch.own), slice(batch.own, None)):
-            if not len(pairs := batch.pairs[part]):
-                continue
-            TL, tL, hL, qL = batch.left
-            TR, tR, hR, qR = batch.right
-            arrays = [pairs, nodes, TL, tL[part], hL, qL[part], TR, tR[part], hR, qR[part], slope]
-            p = [self._ffi.from_buffer("int64_t[]", arrays[0])]
-            p += [self._ffi.from_buffer("double[]", np.ascontiguousarray(each)) for each in arrays[1:]]
-            into = self._ffi.NULL if H is None else self._ffi.from_buffer("double[]", H[part])
-            sizes = qL.shape[1:], (qR.shape[-2] if batch.same else TR.shape[1], qR.shape[-1])
-            value = self._lib.near(
-                len(pairs), p[0], nodes.shape[1], p[1], *sizes[0], *p[2:6], *sizes[1], *p[6:10], batch.same, p[10], into
-            )
-            energy += value if part.start == 0 else 0.0
-        gradient += batch.factor * slope
-        return batch.factor * energy
+        for each in self._batches:
+            every = np.arange(len(each.pairs))
+            left, right = (each.left, every), (each.right, every)
+            energy += self._pairs.add(nodes, each.pairs, each.own, left, right, gradient, stiffness)
+            self._pairs.finish(nodes, each.pairs[:, 0], each.left, gradient, stiffness)
+            if each.right.tables.ndim == 3:
+                self._pairs.finish(nodes, each.pairs[:, 1], each.right, gradient, stiffness)
+        return energy
 
     def _at_boundary(self) -> NDArray[np.bool_]:
         """(cells, 3) sides that no other cell has."""
@@ -227,10 +192,10 @@ class Near:
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
             made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
         most = max(
-            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left[3], each.right[3])), default=0
+            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0
         )
         for each in made:
-            if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left[3], each.right[3])):
+            if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
                 yield each
 
     def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
@@ -247,26 +212,25 @@ class Near:
                 t.reshape(len(t), count, -1),
                 q.reshape(len(q), count, -1, h.shape[-1]),
             )
-        return Batch(
-            pairs, 1.0 if kind[0] == "strip" else 0.5, own, (left[0], left[2], left[1], left[3]), (T, t, h, q), same
-        )
+        share = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
+        return Batch(pairs, own, Points(left[0], left[1], left[2], share * left[3]), Points(T, h, t, q))
 
-    def _rules(self, kind: Kind) -> tuple[Points, Points, bool]:
+    def _rules(self, kind: Kind) -> tuple[Places, Places, bool]:
         """Points of both elements; of the second one those for each of the first, or, if true, the same for all."""
         s = self._scale
         if kind[0] == "faces":
-            first = Points(*around(kind[1], s))
+            first = Places(*around(kind[1], s))
             if kind[2] == "corner":
-                return first, Points(*at_corner(kind[3])), True
+                return first, Places(*at_corner(kind[3])), True
             apex = first.X if kind[2] == "self" else beyond(first.X, kind[3:5], kind[5])
             return first, self._each([polar(each, s) for each in apex]), False
         t, eta, w = strip()
-        first = Points.of_strip(kind[1], t, eta, w)
+        first = Places.of_strip(kind[1], t, eta, w)
         if kind[0] == "strip":
             if kind[2] == "corner":
-                return first, Points(*at_corner(kind[3])), True
+                return first, Places(*at_corner(kind[3])), True
             if kind[2] == "apart":
-                return first, Points(*_quadrature(APART)), True
+                return first, Places(*_quadrature(APART)), True
             foot = on_edge(kind[3], 1 - t if kind[4] else t)
             return first, self._each([polar(each, SPLIT * s) for each in foot]), False
         if kind[2] in ("side", "end"):
@@ -274,17 +238,17 @@ class Near:
             if kind[2] == "end":  # as far from the common end as the place is, beyond it
                 at = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
             found = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
-            return first, Points.of_strip(kind[3], *(np.concatenate(each) for each in zip(*found, strict=True))), False
-        return first, Points.of_strip(kind[3], t, eta, w), True
+            return first, Places.of_strip(kind[3], *(np.concatenate(each) for each in zip(*found, strict=True))), False
+        return first, Places.of_strip(kind[3], t, eta, w), True
 
-    def _each(self, rules: list[tuple[Array, Array]]) -> Points:
+    def _each(self, rules: list[tuple[Array, Array]]) -> Places:
         """Rules for each of some points, made as long as the longest with points of weight zero."""
         longest = max(len(w) for _, w in rules)
         X = [np.concatenate([X, np.repeat(X[:1], longest - len(X), axis=0)]) for X, _ in rules]
         w = [np.concatenate([w, np.zeros(longest - len(w))]) for _, w in rules]
-        return Points(np.concatenate(X), np.concatenate(w))
+        return Places(np.concatenate(X), np.concatenate(w))
 
-    def _found(self, cells: Ints, points: Points, edge: int | None) -> tuple[Array, Array, Array, Array]:
+    def _found(self, cells: Ints, points: Places, edge: int | None) -> tuple[Array, Array, Array, Array]:
         """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
         shape, X = self._shape, points.X
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))

@@ -1,0 +1,397 @@
+/* Charges on pairs of cells: energies of pairs of points, gradients and second derivatives; pairs.py says what for. A
+   charge is at x = r + t eta n of a point of the mid-surface. With the shape functions N_k, their derivatives N_k,a and
+   the dual basis a^a of the surface, dx = N_k du_k - t eta a^a N_k,a (n . du_k). LANES pairs go through at once. */
+#include <math.h>
+#include <string.h>
+
+#define LANES 8
+#define SUMS 24
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define FAST
+#endif
+#define INLINE static inline __attribute__((always_inline))
+
+typedef double v __attribute__((vector_size(8 * LANES)));
+typedef int64_t whole __attribute__((vector_size(8 * LANES)));
+
+typedef struct {
+    v r[3], n[3], up[2][3];  /* place, normal and dual basis */
+    v F[3], W[3];            /* SUMS numbers: the derivative by r, and its moment by t eta, */
+    v K[3][6];               /* second derivatives by r, and their first and second moment: xx, yy, zz, xy, xz, yz */
+    v t;
+} Point;
+
+static const int AT[3][3] = {{0, 3, 4}, {3, 1, 5}, {4, 5, 2}};
+
+/* 1/sqrt(x): two steps of Householder's method, of third order, from the halved exponent. */
+INLINE void inverse_root(const v *x, v *y)
+{
+    whole bits;
+    memcpy(&bits, x, sizeof bits);
+    bits = 0x5fe6eb50c7b537a9 - (bits >> 1);
+    memcpy(y, &bits, sizeof bits);
+    for (int i = 0; i < 2; ++i) {
+        const v one = *x * *y * *y;
+        *y *= 1.875 - one * (1.25 - 0.375 * one);
+    }
+}
+
+INLINE void cross(const v *a, const v *b, v *c)
+{
+    c[0] = a[1] * b[2] - a[2] * b[1], c[1] = a[2] * b[0] - a[0] * b[2], c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* T (3, k): shape functions and their derivatives; nodes (k, 3). */
+INLINE void place(int k, const double *T, const v *nodes, Point *p)
+{
+    v a[3][3];
+    memset(a, 0, sizeof a);
+    for (int l = 0; l < k; ++l)
+        for (int d = 0; d < 3; ++d)
+            for (int i = 0; i < 3; ++i)
+                a[d][i] += T[d * k + l] * nodes[3 * l + i];
+    v m[3], size;
+    cross(a[1], a[2], m);
+    const v square = m[0] * m[0] + m[1] * m[1] + m[2] * m[2];
+    inverse_root(&square, &size);
+    memset(p, 0, sizeof *p);
+    for (int i = 0; i < 3; ++i)
+        p->r[i] = a[0][i], p->n[i] = m[i] * size;
+    cross(a[2], p->n, p->up[0]), cross(p->n, a[1], p->up[1]);
+    for (int i = 0; i < 3; ++i)
+        p->up[0][i] *= size, p->up[1][i] *= size;
+}
+
+/* A symmetric matrix (6,) times a vector. */
+INLINE void times(const v *K, const v *x, v *y)
+{
+    for (int i = 0; i < 3; ++i)
+        y[i] = K[AT[i][0]] * x[0] + K[AT[i][1]] * x[1] + K[AT[i][2]] * x[2];
+}
+
+/* Add what a point's own derivatives are by the nodes of its cell: gradient (k, 3), and unless NULL H (a <= b, 3, 3). */
+INLINE void own(int k, const double *T, const Point *p, v *gradient, v *H)
+{
+    const v *n = p->n;
+    v c[2][3];
+    for (int a = 0; a < 2; ++a) {
+        const v along = p->W[0] * p->up[a][0] + p->W[1] * p->up[a][1] + p->W[2] * p->up[a][2];
+        for (int i = 0; i < 3; ++i)
+            c[a][i] = -along * n[i];
+    }
+    for (int l = 0; l < k; ++l)
+        for (int i = 0; i < 3; ++i)
+            gradient[3 * l + i] += T[l] * p->F[i] + T[k + l] * c[0][i] + T[2 * k + l] * c[1][i];
+    if (!H)
+        return;
+    v g[k][3], first[k][3], second[k][3], turned[k], M[k][9];
+    const v on = p->W[0] * n[0] + p->W[1] * n[1] + p->W[2] * n[2];
+    for (int l = 0; l < k; ++l) {
+        for (int i = 0; i < 3; ++i)
+            g[l][i] = T[k + l] * p->up[0][i] + T[2 * k + l] * p->up[1][i];
+        times(p->K[1], g[l], first[l]), times(p->K[2], g[l], second[l]);
+        turned[l] = p->W[0] * g[l][0] + p->W[1] * g[l][1] + p->W[2] * g[l][2];
+        for (int i = 0; i < 3; ++i) {
+            second[l][i] -= on * g[l][i];
+            for (int j = 0; j < 3; ++j)
+                M[l][3 * i + j] = T[l] * p->K[0][AT[i][j]] - first[l][i] * n[j];
+        }
+    }
+    for (int l = 0; l < k; ++l)
+        for (int m = l; m < k; ++m, H += 9) {
+            const v S = g[l][0] * second[m][0] + g[l][1] * second[m][1] + g[l][2] * second[m][2];
+            v y[3];
+            for (int j = 0; j < 3; ++j)
+                y[j] = S * n[j] + g[l][j] * turned[m] - first[l][j] * T[m];
+            for (int i = 0; i < 3; ++i) {
+                const v z = turned[l] * g[m][i];
+                for (int j = 0; j < 3; ++j)
+                    H[3 * i + j] += T[l] * M[m][3 * i + j] + n[i] * y[j] + z * n[j];
+            }
+        }
+}
+
+/* Values of LANES elements `at`, `step` apart. */
+INLINE void gather(const double *x, int64_t step, const int64_t *at, v *y)
+{
+    for (int c = 0; c < LANES; ++c)
+        (*y)[c] = x[step * at[c]];
+}
+
+/* The energy of the charges q (L,) at one point and p (S,) at another, at heights hL and hR over the thickness; the derivatives of
+   both are added up, and if `bent` the second ones, too. X (4, 6) gets those by both places, and their moments by the
+   left height, the right one, and both. */
+INLINE void between(int64_t L, int64_t S, int bent, Point *left, const v *q, const double *hL, Point *right, const v *p,
+                    const double *hR, v *energy, v *X)
+{
+    v apart[3], F[3], W[3], sum;
+    memset(F, 0, sizeof F), memset(W, 0, sizeof W), memset(&sum, 0, sizeof sum);
+    if (bent)
+        memset(X, 0, 24 * sizeof *X);
+    for (int i = 0; i < 3; ++i)
+        apart[i] = left->r[i] - right->r[i];
+    for (int64_t l = 0; l < L; ++l) {
+        const v z = left->t * hL[l];
+        v from[3], f[3], h[2][6];
+        memset(f, 0, sizeof f), memset(h, 0, sizeof h);
+        for (int i = 0; i < 3; ++i)
+            from[i] = apart[i] + z * left->n[i];
+        for (int64_t s = 0; s < S; ++s) {
+            const v y = right->t * hR[s];
+            v d[3], root;
+            for (int i = 0; i < 3; ++i)
+                d[i] = from[i] - y * right->n[i];
+            const v square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            inverse_root(&square, &root);
+            const v value = q[l] * p[s] * root, inverse = root * root, slope = value * inverse;
+            sum += value;
+            for (int i = 0; i < 3; ++i) {
+                const v g = slope * d[i];
+                f[i] -= g, W[i] += y * g;
+            }
+            if (!bent)
+                continue;
+            const v bend = 3.0 * slope * inverse;
+            const v each[6] = {bend * d[0] * d[0] - slope, bend * d[1] * d[1] - slope, bend * d[2] * d[2] - slope,
+                               bend * d[0] * d[1],         bend * d[0] * d[2],         bend * d[1] * d[2]};
+            for (int i = 0; i < 6; ++i) {
+                const v moment = y * each[i];
+                h[0][i] += each[i], h[1][i] += moment, right->K[2][i] += y * moment;
+            }
+        }
+        for (int i = 0; i < 3; ++i)
+            F[i] += f[i], left->W[i] += z * f[i];
+        for (int i = 0; i < 6 && bent; ++i) {
+            const v first = z * h[0][i];
+            left->K[1][i] += first, left->K[2][i] += z * first;
+            X[i] += h[0][i], X[6 + i] += first, X[12 + i] += h[1][i], X[18 + i] += z * h[1][i];
+        }
+    }
+    *energy += sum;
+    for (int i = 0; i < 3; ++i)
+        left->F[i] += F[i], right->F[i] -= F[i], right->W[i] += W[i];
+    for (int i = 0; i < 6 && bent; ++i)
+        left->K[0][i] += X[i], right->K[0][i] += X[i], right->K[1][i] += X[12 + i];
+}
+
+/* Add the derivatives of a point of LANES elements to the sums of those (.., SUMS), `step` apart; `idle` ones are left out. */
+INLINE void sum_up(const Point *p, int bent, int64_t idle, const int64_t *at, int64_t step, double *sums)
+{
+    const v *each = p->F;
+    for (int c = 0; c < LANES - idle; ++c)
+        for (int i = 0; i < (bent ? SUMS : 6); ++i)
+            sums[step * at[c] + i] += each[i][c];
+}
+
+/* The energy of the first `counted` of `count` pairs of cells (count, 2), a multiple of LANES of which the last `idle`
+   are none; nodes (cells, k, 3). On the first of each pair are P points with the tables TL (P, 3, k), heights hL (P, L),
+   thickness tL (rows, P) and charges qL (rows, P, L), in the row eL (count,); the derivatives at its points are added to
+   sL (rows, P, SUMS). On the second are M points for each of these, TR (P, M, 3, k), hR (P, M, S), tR (rows, P, M),
+   qR (rows, P, M, S), eR; their derivatives are added to gradient (cells, k, 3) and `onto`, see `own`. Or `same` ones
+   for all: without the axis P, and added to sR (rows, M, SUMS). Unless `onto` is NULL, second derivatives by the nodes of
+   both cells times `factor` are added to rows (.., 3, columns, 3), in the row row_of (cells, k) if that is not negative,
+   and the column column_of (cells, k). */
+FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *both, int64_t nodes_of_cell,
+                  const double *nodes, int64_t P, int64_t L, const double *TL, const double *hL, const double *tL,
+                  const double *qL, double *sL, const int64_t *eL, int64_t M, int64_t S, const double *TR,
+                  const double *hR, const double *tR, const double *qR, double *sR, const int64_t *eR, int64_t same,
+                  double *gradient, double factor, double *onto, double *rows, int64_t columns, const int64_t *row_of,
+                  const int64_t *column_of)
+{
+    const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2, bent = onto != 0;
+    const int64_t all = same ? M : P * M;
+    double energy = 0.0;
+    Point points[same ? M : 1];
+    v QR[same ? M * S : S], XL[3 * k], XR[3 * k], GR[3 * k], A[9 * k], B[9 * k], C[2][3 * k];
+    v HR[bent && !same ? half : 1], HX[bent ? 9 * k * k : 1];
+    for (int64_t at = 0; at < count; at += LANES) {
+        v sum, live, q[L];
+        memset(&sum, 0, sizeof sum), memset(GR, 0, sizeof GR);
+        memset(HR, 0, sizeof HR), memset(HX, 0, sizeof HX);
+        int64_t left_cell[LANES], right_cell[LANES];
+        const int64_t none = at + LANES == count ? idle : 0;
+        for (int c = 0; c < LANES; ++c) {
+            left_cell[c] = both[2 * (at + c)], right_cell[c] = both[2 * (at + c) + 1];
+            live[c] = c < LANES - none ? 1.0 : 0.0;
+        }
+        for (int l = 0; l < 3 * k; ++l)
+            gather(nodes + l, 3 * k, left_cell, XL + l), gather(nodes + l, 3 * k, right_cell, XR + l);
+        if (same)
+            for (int64_t m = 0; m < M; ++m) {
+                place(k, TR + m * 3 * k, XR, points + m);
+                gather(tR + m, M, eR + at, &points[m].t);
+                for (int64_t s = 0; s < S; ++s)
+                    gather(qR + m * S + s, M * S, eR + at, QR + m * S + s);
+            }
+        for (int64_t p = 0; p < P; ++p) {
+            Point left;
+            place(k, TL + p * 3 * k, XL, &left);
+            gather(tL + p, P, eL + at, &left.t);
+            for (int64_t l = 0; l < L; ++l) {
+                gather(qL + p * L + l, P * L, eL + at, q + l);
+                q[l] *= live;
+            }
+            if (bent)
+                memset(A, 0, sizeof A), memset(B, 0, sizeof B);
+            for (int64_t m = 0; m < M; ++m) {
+                const int64_t row = same ? m : p * M + m;
+                Point *right = same ? points + m : points;
+                v *charges = same ? QR + m * S : QR, X[24];
+                const double *T = TR + row * 3 * k, *from = hL + p * L, *to = hR + row * S;
+                if (!same) {
+                    place(k, T, XR, right);
+                    gather(tR + row, all, eR + at, &right->t);
+                    for (int64_t s = 0; s < S; ++s)
+                        gather(qR + row * S + s, all * S, eR + at, charges + s);
+                }
+                if (L == 2 && S == 2 && !bent)
+                    between(2, 2, 0, &left, q, from, right, charges, to, &sum, X);
+                else if (L == 2 && S == 2)
+                    between(2, 2, 1, &left, q, from, right, charges, to, &sum, X);
+                else
+                    between(L, S, bent, &left, q, from, right, charges, to, &sum, X);
+                if (!same)
+                    own(k, T, right, GR, bent ? HR : 0);
+                if (!bent)
+                    continue;
+                v a[2][3], b[2][3];
+                for (int e = 0; e < 2; ++e)
+                    times(X + 12, right->up[e], a[e]), times(X + 18, right->up[e], b[e]);
+                for (int i = 0; i < 3; ++i)
+                    for (int j = 0; j < 3; ++j) {
+                        const v n = right->n[j], a0 = X[AT[i][j]], a1 = a[0][i] * n, a2 = a[1][i] * n;
+                        const v b0 = X[6 + AT[i][j]], b1 = b[0][i] * n, b2 = b[1][i] * n;
+                        v *one = A + (3 * i + j) * k, *other = B + (3 * i + j) * k;
+                        for (int l = 0; l < k; ++l) {
+                            one[l] += a0 * T[l] - a1 * T[k + l] - a2 * T[2 * k + l];
+                            other[l] += b0 * T[l] - b1 * T[k + l] - b2 * T[2 * k + l];
+                        }
+                    }
+            }
+            sum_up(&left, bent, none, eL + at, P * SUMS, sL + p * SUMS);
+            if (!bent)
+                continue;
+            const double *T = TL + p * 3 * k;
+            for (int e = 0; e < 2; ++e)
+                for (int l = 0; l < 3 * k; ++l)
+                    C[e][l] = left.up[e][0] * B[l] + left.up[e][1] * B[3 * k + l] + left.up[e][2] * B[6 * k + l];
+            for (int l = 0; l < k; ++l)
+                for (int m = 0; m < 3 * k; ++m) {
+                    const v turned = T[k + l] * C[0][m] + T[2 * k + l] * C[1][m];
+                    for (int i = 0; i < 3; ++i)
+                        HX[(3 * l + i) * 3 * k + m] += left.n[i] * turned - T[l] * A[3 * i * k + m];
+                }
+        }
+        for (int64_t m = 0; m < M && same; ++m)
+            sum_up(points + m, bent, none, eR + at, M * SUMS, sR + m * SUMS);
+        for (int c = 0; c < LANES - none; ++c) {
+            energy += at + c < counted ? sum[c] : 0.0;
+            double *to = gradient + 3 * k * right_cell[c];
+            for (int l = 0; l < 3 * k && !same; ++l)
+                to[l] += GR[l][c];
+            if (!bent)
+                continue;
+            to = onto + half * right_cell[c];
+            for (int l = 0; l < half && !same; ++l)
+                to[l] += HR[l][c];
+            for (int l = 0; l < k; ++l)
+                for (int m = 0; m < k; ++m) {
+                    const int64_t a = row_of[k * left_cell[c] + l], b = row_of[k * right_cell[c] + m];
+                    const int64_t i0 = column_of[k * left_cell[c] + l], j0 = column_of[k * right_cell[c] + m];
+                    for (int i = 0; i < 3; ++i)
+                        for (int j = 0; j < 3; ++j) {
+                            const double h = factor * HX[(3 * l + i) * 3 * k + j * k + m][c];
+                            if (a >= 0)
+                                rows[((3 * a + i) * columns + j0) * 3 + j] += h;
+                            if (b >= 0)
+                                rows[((3 * b + j) * columns + i0) * 3 + i] += h;
+                        }
+                }
+        }
+    }
+    return energy;
+}
+
+/* What sums (count, P, SUMS) of derivatives at points of elements in cells (count,) add to gradient (cells, k, 3) and,
+   unless NULL, to `onto` (cells, a <= b, 3, 3); count is a multiple of LANES, the last `idle` are none. */
+FAST void points(int64_t count, int64_t idle, const int64_t *cells, int64_t nodes_of_cell, const double *nodes, int64_t P,
+                 const double *T, const double *sums, double *gradient, double *onto)
+{
+    const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2;
+    v X[3 * k], G[3 * k], H[onto ? half : 1];
+    for (int64_t at = 0; at < count; at += LANES) {
+        int64_t of[LANES];
+        const int64_t none = at + LANES == count ? idle : 0;
+        for (int c = 0; c < LANES; ++c)
+            of[c] = c < LANES - none ? at + c : at;
+        for (int l = 0; l < 3 * k; ++l)
+            gather(nodes + l, 3 * k, cells + at, X + l);
+        memset(G, 0, sizeof G), memset(H, 0, sizeof H);
+        for (int64_t p = 0; p < P; ++p) {
+            Point point;
+            place(k, T + p * 3 * k, X, &point);
+            v *each = point.F;
+            for (int i = 0; i < (onto ? SUMS : 6); ++i)
+                gather(sums + p * SUMS + i, P * SUMS, of, each + i);
+            own(k, T + p * 3 * k, &point, G, onto ? H : 0);
+        }
+        for (int c = 0; c < LANES - none; ++c) {
+            for (int l = 0; l < 3 * k; ++l)
+                gradient[3 * k * cells[at + c] + l] += G[l][c];
+            for (int l = 0; l < half && onto; ++l)
+                onto[half * cells[at + c] + l] += H[l][c];
+        }
+    }
+}
+
+/* The number of the rule of each pair of a cell from `first` to `last` with any of n, where `apart` (own, n) is not 0; -1
+   of the others. nodes (n, k, 3), centre (n, 3), normal (n, 3), radius (n,). Rules have the rates `least` (rules,): the
+   first one that a pair of cells reaches is taken, the last one by those with none. The return value is 1 if two are too
+   near each other, within h or with a rate below `worst`. */
+FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const double *nodes, const double *centre,
+                   const double *normal, const double *radius, const uint8_t *apart, double h, double space,
+                   double above, int64_t count, const double *least, double worst, int8_t *found)
+{
+    for (int64_t c = first; c < last; ++c)
+        for (int64_t d = 0; d < n; ++d) {
+            int8_t *to = found + (c - first) * n + d;
+            *to = -1;
+            if (!apart[(c - first) * n + d])
+                continue;
+            double between[3], gap = 0.0;
+            for (int i = 0; i < 3; ++i)
+                between[i] = centre[3 * d + i] - centre[3 * c + i], gap += between[i] * between[i];
+            gap = sqrt(gap) - radius[c] - radius[d] - h;
+            const double size = 2.0 * fmax(radius[c], radius[d]);
+            if (gap < size) {
+                double nearest = INFINITY;
+                for (int64_t a = 0; a < k; ++a) {
+                    const double *x = nodes + 3 * (k * d + a);
+                    double away[3] = {x[0] - centre[3 * c], x[1] - centre[3 * c + 1], x[2] - centre[3 * c + 2]};
+                    double across = 0.0, square = 0.0;
+                    for (int i = 0; i < 3; ++i)
+                        across += away[i] * normal[3 * c + i], square += away[i] * away[i];
+                    if (fabs(across) < h && square - across * across < above * above * radius[c] * radius[c])
+                        return 1;
+                    for (int64_t b = 0; b < k; ++b) {
+                        const double *y = nodes + 3 * (k * c + b);
+                        const double distance = (x[0] - y[0]) * (x[0] - y[0]) + (x[1] - y[1]) * (x[1] - y[1]) +
+                                                (x[2] - y[2]) * (x[2] - y[2]);
+                        nearest = fmin(nearest, distance);
+                    }
+                }
+                nearest = sqrt(nearest);
+                gap = fmax(gap, fmax(nearest - h, nearest / 2.0));
+            }
+            const double rate = fmax(gap / size, space);
+            if (!(rate >= worst))
+                return 1;
+            int64_t which = 0;
+            while (which < count - 1 && rate < least[which])
+                ++which;
+            *to = (int8_t)which;
+        }
+    return 0;
+}
