@@ -88,14 +88,17 @@ class Evaluated:
         return self._system._summed(part)
 
     def residual(self) -> Vector:
-        """dPi/du; the terms that are not numbers are noted in the system's `strange`."""
+        """dPi/du, and u itself along directions in which nodes on oblique planes are held.
+
+        The terms that are not numbers are noted in the system's `strange`.
+        """
         system = self._present
         factors = system._factors(self._mu)
         if system.noise is None:
             whole = system._summed(system._gradient(factors))
             if not system._finite(whole.sum()):
                 system.strange = self._not_numbers(factors)
-            return whole
+            return whole if system.projection is None else whole + system.projection.outside(self._u)
         V = system.u.function_space.dofmap
         parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
         noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]

@@ -69,6 +69,12 @@ class Projection:
         nodes, x = self._nodes[here], u.reshape(-1, 3)
         x[nodes] = np.einsum("nij,nj->ni", self._P[here], x[nodes])
 
+    def outside(self, u: Array) -> Array:
+        """u - P u: rounding, which the extrapolation of a path would multiply from step to step."""
+        inside = np.array(u)
+        self.project(inside)
+        return np.asarray(u - inside)
+
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
         """P K P + (I - P); the same object while K is the same, which contact makes another. Collective."""
         if self._by_node is None:

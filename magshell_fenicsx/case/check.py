@@ -49,6 +49,7 @@ def _described(case: Case, problem: Problem) -> str:
     }
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
     lines += _in_units(case)
+    lines += case.several.told if case.several else []
     lines += [line for part in case.context.abilities for line in part.numbers(case.context)]
     patch = None
     if case.mesh.tolerance is None:

@@ -27,6 +27,7 @@ from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.models.shell.parameters import OwnMaterial
     from magshell_fenicsx.models.shell.thickness import Thickness
 
 Array = NDArray[np.float64]
@@ -35,6 +36,7 @@ INSTEAD_OF = ("shell", "boundary", "points")
 OF_NAMES = ("loading", "contact", "joints", "natural", "magnetic")  # sections that name edges, points and patches
 FILES = ("file", "program")  # their values are no such names
 IN_COMMON = ("law", "mooney", "viscosity", "relaxation")
+MOST_UNLIKE = 1e6  # a modulus or a density over that of the first shell, or the other way round
 SHOWN = ("at", "patch", "depth")  # keys of a force that mesh sizes follow
 NAME = re.compile(r"[A-Za-z]\w*")
 
@@ -135,7 +137,9 @@ class Several:
     @cached_property
     def assembly(self) -> Assembly:
         """All of them as one mesh."""
-        return Assembly(self.digest, self._members, self.joints, self._thicknesses)
+        materials = self.materials or {}
+        moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
+        return Assembly(self.digest, self._members, self.joints, self._thicknesses, moduli)
 
     def _members(self) -> list[Member]:
         members = []
@@ -165,6 +169,35 @@ class Several:
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
                 factors[f"{part.name}_{name}"] = ratio * factor
         return None if all(factor == 1.0 for factor in factors.values()) else Thickness(patches=factors)
+
+    @cached_property
+    def materials(self) -> "dict[str, OwnMaterial] | None":
+        """Those of the shells; None where all have that of the first one."""
+        from magshell_fenicsx.models.shell.parameters import OwnMaterial
+
+        first = self.parts[0].case.shell
+        found = {
+            part.name: OwnMaterial(
+                (part.case.shell.modulus or 1.0) / (first.modulus or 1.0),
+                part.case.shell.poisson_ratio,
+                (part.case.shell.density or 1.0) / (first.density or 1.0),
+            )
+            for part in self.parts
+        }
+        return None if len({*found.values()}) == 1 else found
+
+    @property
+    def told(self) -> list[str]:
+        """What `check` says of the scales."""
+        first, materials = self.parts[0].name, self.materials or {}
+        lines = [f"scales: R, h, E, nu and the density are those of the shell {first}"]
+        for part in self.parts[1:]:
+            own = materials.get(part.name)
+            said = f"h {self.ratio(part):.4g} times" + ("" if part.case.thickness_factor is None else " its factor")
+            if own:
+                said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}, density {own.density:.4g} times"
+            lines.append(f"  {part.name}: {said}")
+        return lines
 
     def ratio(self, part: Part) -> float:
         """The thickness of a shell over that of the first one."""
@@ -292,7 +325,7 @@ def _presses(loading: Any, name: str) -> bool:
 
 
 def _merged(parts: Sequence[Part]) -> Keys:
-    """Keys of the shell that stands for all: lengths and material are those of the first."""
+    """Keys of the shell that stands for all: lengths and material, which results are over, are those of the first."""
     first, shell = parts[0], parts[0].case.shell
     for part in parts:
         other = part.case.shell
@@ -309,13 +342,24 @@ def _merged(parts: Sequence[Part]) -> Keys:
             raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
         if isinstance(other, ShellSection) and not other.with_units and other.youngs_modulus is not None:
             raise ValueError(part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs"))
-        for key in (*IN_COMMON, "modulus", "poisson_ratio", "density"):
+        for key in IN_COMMON:
             if getattr(other, key) != getattr(shell, key):
-                key = "youngs_modulus" if key == "modulus" else key
                 raise ValueError(
                     part.refused(
-                        f"shell.{key}: is another than that of {first.name}: several shells have one material; a "
-                        "thickness of its own makes a shell stiffer or softer"
+                        f"shell.{key}: is another than that of {first.name}: several shells have it in common; their "
+                        "youngs_modulus, poisson_ratio and density are their own"
+                    )
+                )
+        for key, name in (("modulus", "youngs_modulus"), ("density", "density")):
+            one, own = getattr(shell, key), getattr(other, key)
+            if (one is None) != (own is None):
+                bare, has = (part, first) if own is None else (first, part)
+                raise ValueError(bare.refused(f"shell.{name}: is missing; {has.name} has one"))
+            if one is not None and not 1 / MOST_UNLIKE <= own / one <= MOST_UNLIKE:
+                raise ValueError(
+                    part.refused(
+                        f"shell.{name}: is {own / one:.3g} times that of {first.name}: allowed 1/{MOST_UNLIKE:g} to "
+                        f"{MOST_UNLIKE:g}; is the unit right?"
                     )
                 )
     unit = _unit if shell.with_units else (lambda value, unit: value)

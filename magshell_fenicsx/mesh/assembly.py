@@ -103,6 +103,8 @@ class Assembly:
         Pairs of names of edges; the first is joined to the second.
     thicknesses
         Name of a shell -> its thickness over that of the first; None where it varies.
+    moduli
+        Name of a shell -> its Young's modulus over that of the first.
     home
         None: no program gave a mesh.
     """
@@ -111,6 +113,7 @@ class Assembly:
     members: Callable[[], Sequence[Member]] = field(repr=False)
     joints: Sequence[tuple[str, str]] = ()
     thicknesses: Mapping[str, float | None] = field(default_factory=dict)
+    moduli: Mapping[str, float] = field(default_factory=dict)
     home: None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Assembly":

@@ -5,6 +5,8 @@ With the displacement u + E(mu(t)), E at nodes that move, the mass is that of al
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
+from operator import mul
 
 import numpy as np
 import ufl
@@ -38,37 +40,40 @@ def whole_mass(model: Model) -> PETSc.Mat:
 
 
 def _product(model: Model) -> fem.Form:
-    factor = thickness(model)
+    factor = weight(model)
     name = "mass" if factor is None else "weighted mass"
     return model.kernels.compile(name, of_displacements(model, 1.0 if factor is None else factor))
 
 
-def thickness(model: Model) -> Expr | None:
-    """What multiplies the thickness of a shell; a solid has it in its shape."""
-    return None if model.thickness is None else model.thickness[0]
+def weight(model: Model) -> Expr | None:
+    """What multiplies the mass of a shell per area: thickness and density; a solid has the first in its shape."""
+    factors = [] if model.thickness is None else [model.thickness[0]]
+    if isinstance(model, ShellModel) and model.made_of is not None:
+        factors.append(model.made_of[2])
+    return reduce(mul, factors) if factors else None
 
 
-def of_displacements(model: Model, weight: Expr | float) -> ufl.Form:
+def of_displacements(model: Model, factor: Expr | float) -> ufl.Form:
     """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
-    product = weight * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
+    product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, model.carrier.whole * product if model.thin else product)
 
 
-def of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
+def of_waves(model: MeridianModel, factor: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
     cosine, sine = zip(*(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
-    return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
+    return _integral(model, factor * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
 
 def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
     """phi . M phi as an energy; of a wave phi has the coefficients (U + V, V, W)."""
-    weight = thickness(model)
+    factor = weight(model)
     if wave is None:
-        V, product = model.V, of_displacements(model, 1.0 if weight is None else weight)
+        V, product = model.V, of_displacements(model, 1.0 if factor is None else factor)
     else:
         assert model.axisymmetric
-        V, product = model.waves.V, of_waves(model, 1.0 if weight is None else weight)
+        V, product = model.waves.V, of_waves(model, 1.0 if factor is None else factor)
     f = fem.Function(V, name="phi")
     f.x.array[: len(phi)] = phi
     f.x.scatter_forward()

@@ -20,7 +20,7 @@ from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, thickness
+from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, weight
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
@@ -157,8 +157,9 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
 
     If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
     """
-    weight, name = (thickness(model), "weighted ") if vibrating and thickness(model) else (1.0, "")
-    mass = f"{name}mass", of_displacements(model, weight)
+    found = weight(model) if vibrating else None
+    factor, name = (1.0, "") if found is None else (found, "weighted ")
+    mass = f"{name}mass", of_displacements(model, factor)
 
     def of(label: str, system: FiniteElementSystem) -> _Family:
         return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection)
@@ -166,7 +167,7 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
     yield of("", model.system)
     if isinstance(model, MeridianModel):
         waves = model.excluded_modes.waves
-        wave_mass = f"{name}wave mass", of_waves(model, weight)
+        wave_mass = f"{name}wave mass", of_waves(model, factor)
         if vibrating:
             yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
         for m in range(1, waves.largest + 1):

@@ -31,7 +31,7 @@ from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Held, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place, places
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
-from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import (
     SurfaceMeasures,
     assemble_dead_loads,
@@ -92,6 +92,8 @@ class ShellModel(Thin):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
+    made_of
+        Of each cell the `parameters.OwnMaterial` of its shell; None where all shells have one.
     mirror
         Of a half model or a sector.
     turns
@@ -147,6 +149,9 @@ class ShellModel(Thin):
         shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
+        self.made_of = None
+        if material.shells:
+            self.made_of = material_field(material.shells, midsurface.mesh, midsurface.patches)
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             cells = midsurface.mesh.topology.index_map(2)
@@ -159,7 +164,9 @@ class ShellModel(Thin):
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
         creases = Creases.of(loads.joints, midsurface) if loads.joints else None
         pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, creases=creases)
+        self.factory = factory = EnergyFactory(
+            carrier, self.u, *of_shell, pressed=pressed, creases=creases, made_of=self.made_of
+        )
         interior = factory.term(factory.interior_edges())
         terms: list[Term] = [factory.term(factory.membrane()), factory.term(factory.bending()), interior]
         held: list[Constraint] = []

@@ -75,6 +75,8 @@ class EnergyFactory:
         Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for 1.
     creases
         Joints with springs or hinges.
+    made_of
+        Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
     """
 
     carrier: Carrier
@@ -90,6 +92,7 @@ class EnergyFactory:
     held: list[HeldEdge] = field(default_factory=list)
     pressed: fem.Function | None = None
     creases: Creases | None = None
+    made_of: fem.Function | None = None
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
@@ -282,7 +285,7 @@ class EnergyFactory:
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
         density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)
-        density = self._thick(density) if term.of_volume else density
+        density = self._weighty(density) if term.of_volume else density
         return self.carrier.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, facets: Facets | None = None) -> dict[str, ufl.Form]:
@@ -293,7 +296,7 @@ class EnergyFactory:
             for column, of in term.observed.items()
         }
         if term.of_volume:
-            by_column = {column: self._thick(density) for column, density in by_column.items()}
+            by_column = {column: self._weighty(density) for column, density in by_column.items()}
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
@@ -327,11 +330,16 @@ class EnergyFactory:
         """The density over E h with the thickness as it varies, if it does."""
         return density if self.thickness is None else thick(density, self.thickness)
 
+    def _weighty(self, density: Density) -> Density:
+        """One of what has mass, with thickness and density of the material as they vary, if they do."""
+        density = self._thick(density)
+        return density if self.made_of is None else thick(density, self.made_of, 2)
+
     def _elastic(self, density: Density) -> Density:
         """The density of the material with the thickness as it varies, and of the natural shape, if there is one."""
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
-        density = elastic(density, law.with_numbers(*numbers), self.thickness)
+        density = elastic(density, law.with_numbers(*numbers), self.thickness, self.made_of)
         return grown(density, self.natural) if self.natural else density
 
     @property

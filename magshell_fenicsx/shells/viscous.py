@@ -237,8 +237,9 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
 
     def law(j: Jet, side: str = "") -> Law:
         """That of the shell at small strains, which a viscous stress follows too."""
-        of_shell = densities.law_at(model.material.law.linear, j)
-        return of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
+        of_shell, own = densities.law_at(model.material.law.linear, j), factory.made_of
+        of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
+        return of_shell if own is None else of_shell.made_of(*((own(side) if side else own)[i] for i in range(2)))
 
     def viscous(j: Jet, side: str = "") -> tuple[Expr, Expr]:
         """The given strain and change of curvature."""

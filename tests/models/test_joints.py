@@ -49,6 +49,24 @@ def test_rigid_and_stiff() -> None:
     assert deflected({"kind": "spring", "stiffness": 1e6 * D}) == pytest.approx(rigid, rel=1e-4)
 
 
+def test_unlike_materials() -> None:
+    """A cantilever of two materials under a force at its end: the beam's curvature, 1e-4."""
+    left = plate([0, 0, 0], boundary={"left": "clamped"})
+    right = plate([1, 0, 0], points={"tip": [1, 0.125, 0]})
+    right["shell"] = right["shell"] | {"youngs_modulus": 5}
+    data = {
+        "shells": {"left": left, "right": right},
+        "joints": [{"edges": ["left.right", "right.left"]}],
+        "mesh": {"degree": 3, "size": 0.25},
+        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "right.right", "force": [0, 0, -1e-9]}],
+                    "factor": 1, "points": 1},
+    }  # fmt: skip
+    scene = Scene(Case.from_source(data))
+    *_, last = follow(scene)
+    exact = 1e-9 / 0.25 * (7 / 3 / D + 1 / 3 / (5 * D))  # the curvature F (2 - x)/D, times 2 - x, over both parts
+    assert -scene.observe(last.point.state)["right_tip_uz"] == pytest.approx(exact, rel=1e-4)
+
+
 def test_angle_of_a_crease() -> None:
     """A weak spring between stiff plates: with the ends held apart it rests where two bars have its angle: 1e-4."""
     angle = 60.0

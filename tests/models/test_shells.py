@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.fields.surface import SurfaceGatherer
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
 h = 0.02
@@ -19,11 +22,11 @@ def cap(**shell: Any) -> dict[str, Any]:
     return {"shell": keys | shell, "boundary": {"rim": "clamped"}, "points": {"tip": [0, 0, 1]}}
 
 
-def end(data: dict[str, Any]) -> tuple[Scene, dict[str, float]]:
-    """The scene of a case, and what is observed at its end."""
+def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
+    """The scene of a case, the state at its end, and what is observed there."""
     scene = Scene(Case.from_source(data))
     *_, last = follow(scene)
-    return scene, scene.observe(last.point.state)
+    return scene, last.point.state, scene.observe(last.point.state)
 
 
 def test_far_apart() -> None:
@@ -34,13 +37,13 @@ def test_far_apart() -> None:
     place = {"position": [7, 1, 5], "axis": {"polar": 180, "azimuth": 25}}
     load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-5, "points": 1}
     both = {"shells": {"lower": lower, "upper": upper | {"place": place}}, "mesh": mesh}
-    _, seen = end(both | {"loading": load | {"on": {"upper": "outside"}}})
-    _, alone = end(upper | {"mesh": mesh, "symmetry": "none", "loading": load})
+    _, _, seen = end(both | {"loading": load | {"on": {"upper": "outside"}}})
+    _, _, alone = end(upper | {"mesh": mesh, "symmetry": "none", "loading": load})
     assert seen["upper_tip_uz"] == pytest.approx(-alone["tip_uz"], rel=1e-10)
     assert seen["volume_change"] == pytest.approx(alone["volume_change"], rel=1e-10)
     assert abs(seen["lower_tip_uz"]) < 1e-16
-    _, seen = end(both | {"loading": load | {"on": {"lower": "inside"}, "pressure": -1e-5}})
-    _, alone = end(lower | {"mesh": mesh, "symmetry": "none", "loading": load})
+    _, _, seen = end(both | {"loading": load | {"on": {"lower": "inside"}, "pressure": -1e-5}})
+    _, _, alone = end(lower | {"mesh": mesh, "symmetry": "none", "loading": load})
     assert seen["lower_tip_uz"] == pytest.approx(alone["tip_uz"], rel=1e-10)
 
 
@@ -49,12 +52,45 @@ def test_sizes() -> None:
     upper = cap(radius=1.5, thickness=0.01) | {"points": {"tip": [0, 0, 1.5]}}
     load = {"kind": "indentation", "control": "load", "points": 1}
     data = {"shells": {"lower": cap(), "upper": upper | {"place": {"position": [0, 0, 9]}}}, "mesh": {"degree": 3}}
-    scene, seen = end(data | {"loading": load | {"at": {"point": "upper.tip"}, "force": 0.05}})
+    scene, _, seen = end(data | {"loading": load | {"at": {"point": "upper.tip"}, "force": 0.05}})
     assert scene.problem.thickness.patches == {"lower": 1.0, "upper": 0.5}
     force = 0.05 * (0.02**3 / 1) / (0.01**3 / 1.5)  # 2 pi D/R of both
     alone = upper | {"mesh": {"degree": 3}, "symmetry": "none"}
-    _, other = end(alone | {"loading": load | {"at": {"point": "tip"}, "force": force}})
+    _, _, other = end(alone | {"loading": load | {"at": {"point": "tip"}, "force": force}})
     assert seen["upper_tip_uz"] == pytest.approx(other["tip_uz"], rel=1e-5)
+
+
+def test_material_of_each() -> None:
+    """With E, nu, density of its own each moves, bends and vibrates as it does alone, 1e-9; scales are of the first."""
+    own = {"youngs_modulus": 3, "poisson_ratio": 0.45}
+    load = {"kind": "indentation", "control": "load", "points": 1}
+    mesh = {"degree": 3, "size": 0.3}
+    lower, upper = cap(density=1), cap(density=5, **own) | {"place": {"position": [0, 0, 9]}}
+    data = {"shells": {"lower": lower, "upper": upper}, "mesh": mesh}
+    scene, state, seen = end(data | {"loading": load | {"at": {"point": "upper.tip"}, "force": 0.05}})
+    force = 0.05 * (1 - 0.45**2) / (1 - 0.3**2) / 3  # 2 pi D/R of both
+    single = cap(**own) | {"mesh": mesh, "symmetry": "none"}
+    other, its_state, its = end(single | {"loading": load | {"at": {"point": "tip"}, "force": force}})
+    assert seen["upper_tip_uz"] == pytest.approx(its["tip_uz"], rel=1e-9)
+    moments = [
+        max(np.abs(SurfaceGatherer(each.model).gather(u.u).fields[name]).max() for name in ("M_1", "M_2"))
+        for each, u in ((scene, state), (other, its_state))
+    ]
+    assert moments[0] == pytest.approx(3 * (1 - 0.3**2) / (1 - 0.45**2) * moments[1], rel=1e-6)  # over D/R of the first
+    squares = [
+        np.array([m.eigenvalue for m in ShellModes(s.model).vibrations(s.unloaded(), 4)]) for s in (scene, other)
+    ]
+    assert squares[0] == pytest.approx(3 / 5 * squares[1], rel=1e-7)
+
+
+def test_spin_of_each() -> None:
+    """Centrifugal forces are of each density: twice E and twice the density, and it moves as the other does, 1e-9."""
+    shells = {
+        name: cap(density=e, youngs_modulus=e, polar=30) | {"place": {"position": [0, 0, z]}}
+        for name, e, z in (("lower", 1, 0), ("upper", 2, 3))
+    }
+    _, _, seen = end({"shells": shells, "mesh": {"degree": 2}, "loading": {"kind": "spin", "speed": 0.02, "points": 1}})
+    assert seen["upper_tip_uz"] == pytest.approx(seen["lower_tip_uz"], rel=1e-9)
 
 
 def test_remanence_of_each() -> None:
@@ -90,8 +126,12 @@ def test_messages() -> None:
         Case.from_source(data | {"boundary": {}})
     with pytest.raises(CaseError, match=r"shells.upper.shell.thickness: 0: must be greater than 0"):
         Case.from_source({"shells": {"lower": cap(), "upper": cap(thickness=0)}})
-    with pytest.raises(CaseError, match=r"shells.upper.shell.poisson_ratio: is another than that of lower"):
-        Case.from_source({"shells": {"lower": cap(), "upper": cap(poisson_ratio=0.5)}})
+    with pytest.raises(CaseError, match=r"shells.upper.shell.law: is another than that of lower"):
+        Case.from_source({"shells": {"lower": cap(), "upper": cap(poisson_ratio=0.5, law="neo-hookean")}})
+    with pytest.raises(CaseError, match=r"shells.upper.shell.density: is missing; lower has one"):
+        Case.from_source({"shells": {"lower": cap(density=1), "upper": cap()}})
+    with pytest.raises(CaseError, match=r"shells.upper.shell.youngs_modulus: is 1e\+09 times that of lower: allowed"):
+        Case.from_source({"shells": {"lower": cap(), "upper": cap(youngs_modulus=1e9)}})
     units = {"radius": "10 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
     measured = {"shells": {"lower": cap(), "upper": cap(**units) | {"points": {}}}}
     with pytest.raises(CaseError, match=r"shells.upper.shell: lengths of upper have units and those of lower none"):

@@ -94,7 +94,7 @@ class Laminated(Law):
 
     def with_numbers(self, *numbers: Any) -> Self:
         names = "h", "number", "A", "B", "D", "axis"
-        return replace(self, t=1, **dict(zip(names, numbers, strict=True)))
+        return replace(self, t=1, e=1, **dict(zip(names, numbers, strict=True)))
 
     @property
     def by_place(self) -> bool:
@@ -115,15 +115,15 @@ class Laminated(Law):
 
     @property
     def bending_stiffness(self) -> Scalar:
-        return Koiter(self.h, self.number, self.t).bending_stiffness
+        return Koiter(self.h, self.number, self.t, self.e).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         strain = _Frame(self.direction, up).strain(E)
-        return self.t / 2 * _work(_stress(self.A, strain), strain)
+        return self.e * self.t / 2 * _work(_stress(self.A, strain), strain)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
-        return frame.raised(self.t, _stress(self.A, frame.strain(E)))
+        return frame.raised(self.e * self.t, _stress(self.A, frame.strain(E)))
 
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
         return self.stress(change, up)
@@ -148,11 +148,11 @@ class Laminated(Law):
 
     @property
     def _of_B(self) -> Scalar:
-        return self.h * self.t**2
+        return self.e * self.h * self.t**2
 
     @property
     def _of_D(self) -> Scalar:
-        return self.h**2 * self.t**3
+        return self.e * self.h**2 * self.t**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
         of_D, of_B = _stress(self.D, frame.strain(K)), _stress(self.B, frame.strain(E))

@@ -8,6 +8,7 @@ A further law is a `Law`, and a line in `parameters.Material.law`.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -32,6 +33,8 @@ class Law(ABC):
         The law's own number.
     t
         What multiplies the thickness.
+    e
+        What multiplies Young's modulus.
     thins
         Whether the thickness follows from the area, so that the volume stays.
     by_place
@@ -41,15 +44,16 @@ class Law(ABC):
     h: Scalar
     number: Scalar
     t: Scalar = 1
+    e: Scalar = 1
     thins: ClassVar[bool] = False
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """All but `t`, in their order; some laws have vectors among them."""
+        """All but `t` and `e`, in their order; some laws have vectors among them."""
         return self.h, self.number
 
     def with_numbers(self, *numbers: Any) -> Self:
-        """The same law with others, and `t` of 1."""
+        """The same law with others, and `t` and `e` of 1."""
         return type(self)(*numbers)
 
     @property
@@ -63,6 +67,10 @@ class Law(ABC):
     def thicker(self, factor: Scalar) -> Self:
         """That of a shell so many times as thick."""
         return replace(self, t=factor * self.t)
+
+    def made_of(self, e: Scalar, nu: Scalar) -> Self:
+        """That of a shell whose Young's modulus is so many times as large, and with its own nu where a law has one."""
+        return replace(self, e=e * self.e)
 
     @property
     @abstractmethod
@@ -117,22 +125,25 @@ class Koiter(Law):
     def nu(self) -> Scalar:
         return self.number
 
+    def made_of(self, e: Scalar, nu: Scalar) -> "Koiter":
+        return replace(self, e=e * self.e, number=nu)
+
     @property
     def linear(self) -> "Koiter":
         return self
 
     @property
     def bending_stiffness(self) -> Scalar:
-        return self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
+        return self.e * self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        return self.t * self._square(E, up) / (2 * (1 - self.nu**2))
+        return self.e * self.t * self._square(E, up) / (2 * (1 - self.nu**2))
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         return self.bending_stiffness / 2 * self._square(K, up)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        return self._scaled(self.t / (1 - self.nu**2), E, up)
+        return self._scaled(self.e * self.t / (1 - self.nu**2), E, up)
 
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
         return self.stress(change, up)
@@ -181,21 +192,27 @@ def work(S: Components, T: Tensor) -> Scalar:
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
 
 
-def elastic(density: Density, law: Law, t: Parameter | None = None) -> Density:
+def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None) -> Density:
     """Of a density that takes a `law`, on two sides a pair of laws, that of a law whose numbers are constants.
 
-    `t` is what multiplies the thickness, (1,); None for 1.
+    `t` is what multiplies the thickness, (1,), None for 1; `made_of` begins with what `Law.made_of` takes.
     """
 
-    def of(*arguments: Expr, **known: Any) -> Expr:
-        given, factors = list(arguments), [1] * density.sides
-        if t is not None:
-            factor = given.pop()
-            factors = [each[0] for each in (factor if density.sides == 2 else [factor])]
-        count = len(given) - len(law.numbers)
-        laws = tuple(law.with_numbers(*given[count:]).thicker(each) for each in factors)
-        return density.of(*given[:count], law=laws if density.sides == 2 else laws[0], **known)
+    def by_side(value: Any) -> Sequence[Any]:
+        return value if density.sides == 2 else [value]
 
-    numbers = (*density.parameters, *law.numbers)
-    parameters = numbers if t is None else (*numbers, t)
+    def of(*arguments: Expr, **known: Any) -> Expr:
+        given, factors, materials = list(arguments), [1] * density.sides, None
+        if made_of is not None:
+            materials = by_side(given.pop())
+        if t is not None:
+            factors = [each[0] for each in by_side(given.pop())]
+        count = len(given) - len(law.numbers)
+        laws = [law.with_numbers(*given[count:]).thicker(each) for each in factors]
+        if materials is not None:
+            laws = [each.made_of(own[0], own[1]) for each, own in zip(laws, materials, strict=True)]
+        return density.of(*given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **known)
+
+    fields = (each for each in (t, made_of) if each is not None)
+    parameters = (*density.parameters, *law.numbers, *fields)
     return replace(density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still)

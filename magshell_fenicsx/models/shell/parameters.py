@@ -1,5 +1,6 @@
 """What a shell is made of and what loads it, dimensionless."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,13 +27,35 @@ Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] 
 
 
 @dataclass(frozen=True)
+class OwnMaterial:
+    """Of one shell of several: Young's modulus over that of the first one, nu, and the density over that of the first.
+
+    >>> OwnMaterial(2.0, 0.3).numbers
+    (2.0, 0.3, 1.0)
+    """
+
+    modulus: float
+    nu: float
+    density: float = 1.0
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """All."""
+        return self.modulus, self.nu, self.density
+
+
+@dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units."""
+    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units.
+
+    `shells` are the materials of several shells by their names, of which the first has nu; None if all have one.
+    """
 
     nu: float
     h: float
     rubber: float | None = None
     laminate: Laminate | None = None
+    shells: Mapping[str, OwnMaterial] | None = None
 
     @property
     def law(self) -> Law:

@@ -28,7 +28,7 @@ class Rubber(Law):
 
     @property
     def linear(self) -> Koiter:
-        return Koiter(self.h, 0.5, self.t)
+        return Koiter(self.h, 0.5, self.t, self.e)
 
     @property
     def bending_stiffness(self) -> Scalar:
@@ -36,14 +36,14 @@ class Rubber(Law):
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         at = _Stretched(E, up)
-        return self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
+        return self.e * self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         at = _Stretched(E, up)
         first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
         second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
         by_T, by_D = (
-            self.t / (6 * at.d) * ((1 - self.number) * one + self.number * two)
+            self.e * self.t / (6 * at.d) * ((1 - self.number) * one + self.number * two)
             for one, two in zip(first, second, strict=True)
         )
         adjugate = E[..., 1, 1], -E[..., 0, 1], E[..., 0, 0]
@@ -87,7 +87,7 @@ class Rubber(Law):
 
     def _stiffness(self, at: "_Stretched") -> tuple[Scalar, Scalar, Scalar]:
         """What multiplies T^2, T tr K and det K in twice the energy of bending, T = a^ij K_ij with the deformed a."""
-        factor = self.t**3 * self.h**2 / 18 / at.d**2  # h^2/(12 d) times 4/6 and 1/d
+        factor = self.e * self.t**3 * self.h**2 / 18 / at.d**2  # h^2/(12 d) times 4/6 and 1/d
         one, two, t = 1 - self.number, self.number, 2 + at.T
         of_det = one + two * (t - _root(at.d))  # W'' has d^2 in place of the root
         return factor * 2 * (one + two * t), factor * 2 * two, factor * 2 * of_det * at.up / at.d

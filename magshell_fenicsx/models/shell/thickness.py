@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
@@ -14,6 +14,7 @@ from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.parameters import OwnMaterial
 from magshell_fenicsx.models.shell.patterns import Carried, cells_of, places
 
 Array = NDArray[np.float64]
@@ -112,6 +113,18 @@ def thickness_field(
     return nodal_thickness(values, nodes, V)
 
 
+def material_field(
+    shells: Mapping[str, OwnMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
+) -> fem.Function:
+    """Modulus over that of the first shell, nu and density over that of the first, in each cell; shape (3,)."""
+    Q = fem.functionspace(domain, ("DG", 0, (3,)))
+    field = fem.Function(Q, name="material")
+    values = field.x.array.reshape(-1, 3)
+    for name, own in shells.items():
+        values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = own.numbers
+    return field
+
+
 def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
     """Some of this rank's cells."""
     return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
@@ -146,11 +159,11 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "lo
     return patches[name]
 
 
-def thick(density: Density, t: fem.Function) -> Density:
-    """A density per E h where the thickness is h t."""
+def thick(density: Density, t: fem.Function, component: int = 0) -> Density:
+    """A density per E h where the thickness is h t, or another component of t multiplies it."""
 
     def of(*arguments: Expr) -> Expr:
         *given, factor = arguments
-        return factor[0] * density.of(*given)
+        return factor[component] * density.of(*given)
 
     return replace(density, of=of, parameters=(*density.parameters, t))

@@ -125,13 +125,22 @@ class Stresses:
         (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
     thickness
         (cells, points) factor of h; None for 1.
+    made_of
+        (cells, 3) `parameters.OwnMaterial` of each cell; None for that of `material`.
     """
 
-    def __init__(self, r0: Array, material: Material, thickness: Array | None, natural: Natural | None = None) -> None:
+    def __init__(
+        self,
+        r0: Array,
+        material: Material,
+        thickness: Array | None,
+        natural: Natural | None = None,
+        made_of: Array | None = None,
+    ) -> None:
         self.frame = frame = TangentFrame.of(r0)
         self._thickness = thickness
         self._law = material.law.at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
-        self._natural = natural and natural.at(r0[0], self.frame.n0)
+        self._natural, self._made_of = natural and natural.at(r0[0], self.frame.n0), made_of
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
         """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
@@ -147,6 +156,8 @@ class Stresses:
         frame, total = self.frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
+        if self._made_of is not None:
+            law = law.made_of(self._made_of[:, :1], self._made_of[:, 1:2])
         if self._natural:
             total["E_total"] = E
             shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))

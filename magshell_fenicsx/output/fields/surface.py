@@ -115,7 +115,7 @@ class SurfaceGatherer:
         thick, thick_inside = (self._thickness(at) for at in (self._places, self._inner))
         others = loads.contacts, loads.remanence, loads.natural
         self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
-        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
+        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural, self._made_of())
         self._six = six(self._stresses.frame)
         if numbers is not None:
             self._number(numbers, r[0], inner[0])
@@ -192,6 +192,11 @@ class SurfaceGatherer:
         V = factor.function_space
         values = V.element.basix_element.tabulate(0, at)[0, :, :, 0]
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
+
+    def _made_of(self) -> Array | None:
+        """The material of each owned cell, where shells have their own."""
+        own = self._model.made_of
+        return None if own is None else own.x.array.reshape(-1, 3)[own.function_space.dofmap.list[: self._owned, 0]]
 
     def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
         """The matrix of the mean of the cells that share a node, weighted by area, from the nodes of all cells."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import Field
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.step import ProgrammeStep
     from magshell_fenicsx.shape.outline import Outline
 
+Value = TypeVar("Value")
 WHOLE = "shell"
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
 Pairs = Annotated[
@@ -73,16 +74,24 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.thicknesses if several else {})}
+        thicknesses, moduli = (several.thicknesses, several.moduli) if several else ({}, {})
+        return {"pairs": pairs(self.given, context.shell.poisson_ratio, thicknesses, moduli)}
 
 
-def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, float | None]) -> tuple[Pair, ...]:
+def pairs(
+    given: Sequence[Sequence[str]],
+    nu: float,
+    thickness: Mapping[str, float | None],
+    moduli: Mapping[str, float] | None = None,
+) -> tuple[Pair, ...]:
     """What a case's pairs are in a model.
 
     Parameters
     ----------
     thickness
         Of several shells: name -> thickness over h, None where it varies.
+    moduli
+        Of several shells: name -> Young's modulus over E; the penalty is that of the softer one.
 
     Raises
     ------
@@ -92,16 +101,26 @@ def pairs(given: Sequence[Sequence[str]], nu: float, thickness: Mapping[str, flo
     k = STIFF / (12 * (1 - nu**2))
     several = len(given) > 1
     return tuple(
-        Pair((one, other), f"_{one}_{other}" if several else "", k, thickness=_mean(i, (one, other), thickness))
+        Pair(
+            (one, other),
+            f"_{one}_{other}" if several else "",
+            k * min([*_of_shells(one, moduli or {}), *_of_shells(other, moduli or {})], default=1.0),
+            thickness=_mean(i, (one, other), thickness),
+        )
         for i, (one, other) in enumerate(given)
     )
+
+
+def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
+    """Those of the shells that are part of what is named, or of which it is a patch."""
+    return [value for shell, value in values.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
 
 
 def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
     """The mean thickness of a pair over h; a patch is as thick as its shell."""
     found = list[float]()
     for name in pair if thickness else ():
-        of = [t for shell, t in thickness.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
+        of = _of_shells(name, thickness)
         if None in of or len({*of}) > 1:
             raise CaseError(
                 f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "

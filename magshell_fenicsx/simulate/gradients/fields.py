@@ -293,10 +293,12 @@ def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
     t, over, log = model.thickness, model.over_area(), model.kernels
     Q, comm = t.function_space, t.function_space.mesh.comm
     one = fem.Constant(Q.mesh, 1.0)
-    area = comm.allreduce(fem.assemble_scalar(log.compile("area", over(one))))
-    value = comm.allreduce(fem.assemble_scalar(log.compile("mass", over(t[0])))) / area
+    own = model.made_of if isinstance(model, ShellModel) else None
+    rho = 1.0 if own is None else own[2]
+    area = comm.allreduce(fem.assemble_scalar(log.compile("area", over(rho * one))))
+    value = comm.allreduce(fem.assemble_scalar(log.compile("mass", over(rho * t[0])))) / area
     forces = fem.Function(Q)
-    fem.assemble_vector(forces.x.array, log.compile("mass by thickness", over(ufl.TestFunction(Q)[0])))
+    fem.assemble_vector(forces.x.array, log.compile("mass by thickness", over(rho * ufl.TestFunction(Q)[0])))
     forces.x.scatter_reverse(InsertMode.add)
     cells = Q.mesh.topology.index_map(Q.mesh.topology.dim).size_local
     density = forces.x.array[Q.dofmap.list[:cells]][..., None] / area
