@@ -123,7 +123,7 @@ class SolidModel(Observed):
         if loads.pressure:
             potential = not self.without_potential
             self._terms += factory.pressure(material.classical_pressure, potential=potential)
-        self._terms += [factory.own(term) for term in loads.own]
+        self._terms += [factory.own(term) for term in loads.own if term.density]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])

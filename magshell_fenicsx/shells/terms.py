@@ -279,6 +279,7 @@ class EnergyFactory:
 
     def own(self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; `facets` of a term's edge."""
+        assert term.density
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
         density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)

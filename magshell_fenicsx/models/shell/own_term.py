@@ -96,7 +96,8 @@ class OwnTerm:
         Of (r0, u, *parameters): jets of the placement and of the displacement (see `kinematics.Jet`; r = r0 + u),
         lengths in R, to a UFL scalar in E h per undeformed area. It must not depend on the coordinates that the
         jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
-        the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
+        the first derivatives of u; an energy of its second derivatives would miss the rotations between cells. None:
+        it has no energy and only observes, also second derivatives.
     parameters
         Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can. A
         dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place;
@@ -104,14 +105,16 @@ class OwnTerm:
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
-        Column -> density as above; mu times its integral over the whole shell is observed along a path. A model has
-        only the symmetries that these leave too.
+        Column -> density as above; mu times its integral over the whole shell is observed along a path, the integral
+        itself without an energy. A model has only the symmetries that these leave too.
     of_volume
         Whether the densities are those of a volume, over E: the thickness multiplies them where it varies, and a solid
         has them in all of its body. They depend on the places r0.r and u.r alone.
     on
         Name of an edge. The densities are then in E h R per undeformed length of it, and take a `kinematics.Edge` after
         the jets: its outward conormal, and derivatives along this and by arc length. A solid has no such energies.
+    key
+        That of the case file with this name, for messages.
 
     Raises
     ------
@@ -120,12 +123,13 @@ class OwnTerm:
     """
 
     name: str
-    density: Callable[..., Expr]
+    density: Callable[..., Expr] | None
     parameters: tuple[float | Array | Free | GivenField | ByPlace | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
     on: str | None = None
+    key: str = ""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -134,6 +138,10 @@ class OwnTerm:
             raise ValueError(f"{self.name}: value: {self.value!r}: must be a finite number")
         if not isinstance(self.on, str | None):
             raise ValueError(f"{self.name}: on: {self.on!r}: must be the name of one edge")
+        if not self.densities:
+            raise ValueError(f"{self.name}: has neither a density nor anything that it observes")
+        if self.density is None and (self.free or self.value):
+            raise ValueError(f"{self.name}: only observes: a value or a Free parameter needs a density")
         if self._symbolic.W.ufl_shape:
             raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}")
         if strangers := self._strangers():
@@ -141,9 +149,9 @@ class OwnTerm:
                 f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
                 "The position is r0.r, a number that is the same everywhere goes into the parameters"
             )
-        if not self.parts:
+        if self.density and not self.parts:
             raise ValueError(f"{self.name}: the density does not depend on the displacement")
-        if curved := [part for part in self.parts if part in SECOND]:
+        if self.density and (curved := [part for part in self.parts if part in SECOND]):
             raise ValueError(
                 f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; without a term on "
                 "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
@@ -154,6 +162,11 @@ class OwnTerm:
         bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
+
+    @property
+    def densities(self) -> "tuple[Callable[..., Expr], ...]":
+        """Its energy's, if it has one, then those that it observes."""
+        return (*((self.density,) if self.density else ()), *self.observed.values())
 
     @cached_property
     def parts(self) -> tuple[str, ...]:
@@ -257,7 +270,7 @@ class OwnTerm:
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(sample, self.density) for sample in _random_samples()]
+        values = [self._value(sample, self.densities[0]) for sample in _random_samples()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
@@ -274,7 +287,7 @@ class OwnTerm:
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
         m = ufl.Coefficient(ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,))))
         try:
-            return Symbolic(self._at(r0, u, m, self.density), r0, u, m)
+            return Symbolic(self._at(r0, u, m, self.densities[0]), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
             said = f"{type(e).__name__}: {e}"
             taken = "r0, u" if self.on is None else "r0, u, an edge"
@@ -307,7 +320,7 @@ class OwnTerm:
 
     def _same(self, *samples: "Sample") -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
-        for density in (self.density, *self.observed.values()):
+        for density in self.densities:
             here, there = (self._value(sample, density) for sample in samples)
             if not abs(here - there) <= SAME * max(abs(here), abs(there)):  # nan: no symmetry is known
                 return False

@@ -301,3 +301,24 @@ def test_parameters_need_no_new_kernel() -> None:
     assert one == other
     u = random_displacement(models[0], 1e-2)
     assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))
+
+
+@pytest.mark.parametrize(("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")])
+def test_a_term_that_only_observes(model: str, symmetry: str) -> None:
+    """The mean displacement of the hanging strip is ρ g L²/(3 E), its area before that L²/10; no amplitude is added."""
+    sections = {
+        "model": model,
+        "shell": {"geometry": "strip", "width": 0.1, "radius_to_thickness": 50.0, "poisson_ratio": 0.0},
+        "boundary": {"root": "clamped"},
+        "loading": {"kind": "gravity", "direction": [1, 0, 0], "acceleration": 1e-3, "points": 1},
+        "symmetry": symmetry,
+    }
+    seen = {"mean_ux": lambda r0, u: 10 * u.r[0], "area": lambda r0, u: ufl.as_ufl(1.0)}
+    case = Case.from_source(Source("test", sections))
+    scene = Scene(case, terms=[OwnTerm("mean", None, observed=seen, of_volume=model == "solid")])
+    *_, record = follow(scene)
+    row = scene.observe(record.point.state)
+    assert row["mean_ux"] == pytest.approx(1e-3 / 3, rel=2e-3)
+    assert row["area"] == pytest.approx(0.1)
+    assert "mean" not in scene.extra_columns
+    assert "mean" not in record.point.state.mu
