@@ -1,6 +1,6 @@
 """The shell's own weight: its density times an acceleration along one direction."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import ufl
@@ -15,6 +15,10 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 ACCELERATION = Unit(
     "E/(ρ R)",
@@ -65,6 +69,9 @@ class GravityStep(PathStep):
 
     def scale(self, now: Now) -> float:
         return abs(self.acceleration or now.h**2)
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        return [Leaves(vectors=[np.array(self.direction)])]
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
         along = np.array(self.direction) / np.linalg.norm(self.direction)

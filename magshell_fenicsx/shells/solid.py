@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential
+from magshell_fenicsx.models.shell.parameters import Condition, Material, moments, potentials
 from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
@@ -135,11 +135,11 @@ class SolidModel(Observed):
         for name, dead in loads.dead.items():
             assert on
             self._terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
-            moments = [load for load in dead if isinstance(load, EdgeMoment)]
             self._terms += [
-                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name) for i, m in enumerate(moments)
+                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
+                for i, m in enumerate(moments(dead))
             ]
-            self._terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
+            self._terms += [factory.own(term, name) for term in potentials(dead)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)

@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import DeadLoad, EdgeMoment, Material, Potential
+from magshell_fenicsx.models.shell.parameters import DeadLoad, Material, moments, potentials
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 from magshell_fenicsx.parts.bodies.contact import (
@@ -157,12 +157,11 @@ class EnergyFactory:
 
     def dead_energies(self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]) -> list[Energy]:
         """The moments and one's own potentials among the dead loads of an amplitude."""
-        moments = [load for load in loads if isinstance(load, EdgeMoment)]
         turning = [
             self.edge_moment(f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name)
-            for i, load in enumerate(moments)
+            for i, load in enumerate(moments(loads))
         ]
-        return turning + [self.own(load.term, amplitude=name) for load in loads if isinstance(load, Potential)]
+        return turning + [self.own(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""

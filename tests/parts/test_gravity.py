@@ -154,3 +154,23 @@ def test_history() -> None:
     scene = ms.Scene(made(shell=CAP, boundary={"rim": "clamped"}, loading=steps))
     rows = [scene.observe(record.point.state)["gravity"] for record in ms.follow(scene)]
     assert rows[-2:] == pytest.approx([2e-6, 3e-6])
+
+
+@pytest.mark.parametrize("factor", [None, "exp(0.6*x + 0.8*y)"])
+def test_a_half_beside_the_first_axis(factor: str | None) -> None:
+    """Gravity across the axis of a disc chooses the plane of the half, also on a bed that varies in this plane."""
+    sections: dict[str, Any] = {
+        "shell": {"geometry": "disc", "radius_to_thickness": 50.0, "poisson_ratio": 0.3},
+        "boundary": {"rim": "hinged"},
+        "loading": {"kind": "gravity", "direction": [0.6, 0.8, -1], "acceleration": 1e-5, "points": 1},
+        "points": {"here": [0.3, 0.4, 0], "there": [0.0, 0.0, 0.0]},
+        "mesh": {"size": 0.25},
+        "foundation": {"stiffness": 1e-4, "tangential": 0.01, **({"factor": factor} if factor else {})},
+    }
+    half, whole = (made(**sections, symmetry=symmetry) for symmetry in ("auto", "none"))
+    assert make_problem(half).half
+    row, known = ended(half), ended(whole)
+    assert row["here_ux"] > 0
+    assert row["here_uy"] > 0
+    for column in ("here_ux", "here_uy", "here_uz", "there_uz", "foundation_force", "energy"):
+        assert row[column] == pytest.approx(known[column], rel=1e-4)

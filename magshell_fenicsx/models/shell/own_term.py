@@ -21,7 +21,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
 from magshell_fenicsx.input.expressions import function
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.mirror import Y0, Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
 from magshell_fenicsx.shape.symmetry import Leaves, mirrors_formula
@@ -62,15 +62,22 @@ class ByPlace:
         The formula.
     key
         That of the case file, for messages.
+    turn
+        The frame of the model is turned about e3 by it (rad), the formula's is not.
     """
 
     text: str
     key: str
+    turn: float = 0.0
 
     @property
     def of_place(self) -> "Callable[[Array, Array, Array], Array]":
-        """The formula as a function of arrays."""
-        return function(self.text)
+        """The formula as a function of arrays of coordinates in the model's frame."""
+        of_case = function(self.text)
+        if not self.turn:
+            return of_case
+        Q = rotation(self.turn)
+        return lambda x, y, z: of_case(*(Q[0, i] * x + Q[1, i] * y + Q[2, i] * z for i in range(3)))
 
     def turns(self, outline: "Outline") -> bool:
         """Whether it is the same all around e3."""
@@ -205,6 +212,34 @@ class OwnTerm:
 
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
+    def turned(self, angle: float) -> "OwnTerm":
+        """The same in a frame that is turned about e3 (rad)."""
+        if not angle or (self.turns and not self.by_place):
+            return self
+
+        def back(v: Expr, about: Expr) -> Expr:
+            (c, s), (x, y, z) = (about[0], about[1]), (v[0], v[1], v[2])
+            return ufl.as_vector([c * x - s * y, s * x + c * y, z])
+
+        def in_frame(density: Callable[..., Expr]) -> Callable[..., Expr]:
+            def of(r0: Jet, u: Jet, *others: Any) -> Expr:
+                *rest, about = others
+                jets = (Jet(*(back(part, about) for part in jet.parts())) for jet in (r0, u))
+                if self.on is not None:
+                    edge, *rest = rest
+                    rest = [replace(edge, outward=back(edge.outward, about), along=back(edge.along, about)), *rest]
+                return density(*jets, *rest)
+
+            return of
+
+        parameters = (replace(p, turn=angle) if isinstance(p, ByPlace) else p for p in self.parameters)
+        return replace(
+            self,
+            density=in_frame(self.density) if self.density else None,
+            parameters=(*parameters, np.array([np.cos(angle), np.sin(angle)])),
+            observed={column: in_frame(density) for column, density in self.observed.items()},
+        )
+
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density that takes a function of one number as a vector of one."""
         alone = [isinstance(p, Coefficient) and p.ufl_shape == (1,) for p in self.parameters]
@@ -251,18 +286,11 @@ class OwnTerm:
         return all(self._same(sample, image(*sample)) for sample in _random_samples())
 
     def leaves(self, outline: "Outline") -> Leaves:
-        """The symmetry that it leaves.
-
-        The frame of a half of what is round is turned to its plane: a term that does not turn stays behind.
-        """
-
+        """The symmetry that it leaves."""
         turns = self.turns and all(p.turns(outline) for p in self.by_place)
 
         def mirrors(mirror: Mirror) -> bool:
-            turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
-            if turned and not turns:
-                return False
-            return self.mirrored(Y0 if turned else mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
+            return self.mirrored(mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
 
         shared, name = self.mirrored(Y0) and turns, self.name + (" or what it observes" if self.observed else "")
         return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)

@@ -246,7 +246,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
 
 @pytest.mark.parametrize(
     ("name", "built"),
-    [("winkler", "meridian"), ("weight along e1", "half shell"), ("weight along e2", "full shell")],
+    [("winkler", "meridian"), ("weight along e1", "half shell"), ("weight along e2", "half shell")],
 )
 def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     of, parameters, *_ = DENSITIES[name]
@@ -256,12 +256,16 @@ def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     assert problem.included[-1] == "own energy: own"
 
 
-def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
-    """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
+def test_half_model_of_another_plane() -> None:
+    """The half shell's frame is turned to its mirror plane, and a direction in this plane with it."""
     settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     assert make_problem(case, [OwnTerm("own", winkler)]).half
     assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
+    within = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.5])
+    problem = make_problem(case, [OwnTerm("own", weight, (within,))])
+    assert problem.half
+    assert problem.azimuth == pytest.approx(np.radians(20))
 
 
 @pytest.mark.parametrize(
@@ -277,7 +281,7 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
 def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     with pytest.raises(CaseError, match=said):
-        make_problem(case, [OwnTerm(name, weight, (E2,)) for name in names])
+        make_problem(case, [OwnTerm(name, weight, (TILTED,)) for name in names])
 
 
 def test_a_solid_has_no_curvature() -> None:
