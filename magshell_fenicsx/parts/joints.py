@@ -85,9 +85,7 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         """See that the edges are of several shells, each joined once, and that all else goes with joints."""
         if not context.sections.get("shells"):
             raise ValueError("joints: join edges of several shells: give shells")
-        context.needs("joints", "a mid-surface")
-        if context.shell.viscosity is not None or context.shell.relaxation:
-            raise ValueError("joints: with viscosity or relaxation they are not built: leave these out")
+        context.needs("joints", "a mid-surface", "a material without viscosity")
         taken = set[str]()
         for i, section in enumerate(self.given):
             if section.stiffness:
