@@ -4,9 +4,9 @@ A new kind is such a file, named after it, and its name here.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args
 
-from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
 from magshell_fenicsx.input.section import Chosen, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
@@ -66,6 +66,14 @@ class ShellKeys(LawKeys):
     """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
     imperfections: Imperfections = Field(default=[])
     """Deviations of the mid-surface along its normal, added up"""
+
+    @model_validator(mode="after")
+    def _laminate_fits(self) -> Self:
+        if self.laminate and self.law != "koiter":
+            raise ValueError(f"laminate: needs law: koiter: its strains are small; here the law is {self.law}")
+        if self.laminate and (self.viscosity is not None or self.relaxation):
+            raise ValueError("laminate: has no viscosity and no relaxation: these are of one isotropic material")
+        return self
 
     @classmethod
     def note_sizes(

@@ -184,7 +184,7 @@ class Laminated(Ability):
             )
             raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
         section.refuse_unfit_sizes(context.shell.youngs_modulus or 1.0)
-        context.needs("shell.laminate", "a mid-surface", "small strains", "a material without viscosity")
+        context.needs("shell.laminate", "a mid-surface")
         if section.twists:
             context.needs(
                 "shell.laminate",

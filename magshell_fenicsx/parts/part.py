@@ -243,7 +243,6 @@ Offer = Literal[
     "the same thickness everywhere",
     "a thickness that does not change",
     "the area as drawn",
-    "small strains",
     "a material without viscosity",
 ]
 

@@ -50,11 +50,8 @@ class Rubber(Ability):
             context.needs(f"shell.law: {self.law}", "a mid-surface", hint="a solid is neo-Hookean")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """Rubber keeps its volume at any strain."""
-        return {
-            "a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter",
-            "small strains": f"shell.law: {self.law} is for large ones: take koiter",
-        }
+        """Rubber keeps its volume."""
+        return {"a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"}
 
 
 def law_account(rubber: float | None) -> str:

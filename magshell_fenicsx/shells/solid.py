@@ -27,12 +27,12 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
-from magshell_fenicsx.models.shell.parameters import Condition, Material, moments, potentials
+from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
-from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.loads import Loads, moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import Shape, body_shape, growth_in_body

@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import DeadLoad, Material, moments, potentials
+from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 from magshell_fenicsx.parts.bodies.contact import (
@@ -42,6 +42,7 @@ from magshell_fenicsx.parts.bodies.contact import (
 from magshell_fenicsx.parts.gap import thinning
 from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
 from magshell_fenicsx.parts.joints import Creases
+from magshell_fenicsx.parts.loads import moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation

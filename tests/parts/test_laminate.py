@@ -121,12 +121,8 @@ def test_what_is_refused() -> None:
         "plies: their fractions must add up to 1": {"laminate": {"plies": plies(0, 90)[:1]}},
         "along: a vector of length zero is no direction": {"laminate": {"plies": plies(0), "along": [0.0, 0.0, 0.0]}},
         "give each of E1, E2, G12 a unit, or none": {"laminate": {"plies": [plies(0)[0] | {"E1": "3 GPa"}]}},
-        "laminate: needs small strains; shell.law: neo-hookean": {
-            "laminate": {"plies": plies(0)},
-            "law": "neo-hookean",
-            "poisson_ratio": 0.5,
-        },
-        "laminate: needs a material without viscosity": {"laminate": {"plies": plies(0)}, "viscosity": 0.1},
+        "laminate: needs law: koiter": {"laminate": {"plies": plies(0)}, "law": "neo-hookean", "poisson_ratio": 0.5},
+        "laminate: has no viscosity and no relaxation": {"laminate": {"plies": plies(0)}, "viscosity": 0.1},
     }
     for message, keys in wrong.items():
         with pytest.raises(CaseError, match=message.replace("^", r"\^")):

@@ -1,6 +1,5 @@
 """What a shell is made of and what loads it, dimensionless."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -113,21 +112,6 @@ class Potential:
 
 
 DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce | Potential
-
-
-def moments(loads: Iterable[DeadLoad]) -> list[EdgeMoment]:
-    """The moments among dead loads."""
-    return [load for load in loads if isinstance(load, EdgeMoment)]
-
-
-def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
-    """The energies of those that depend on the deformed place."""
-    return [load.term for load in loads if isinstance(load, Potential)]
-
-
-def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
-    """All others: their work is their size times a displacement along themselves."""
-    return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]
 
 
 @dataclass(frozen=True)

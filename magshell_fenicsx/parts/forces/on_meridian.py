@@ -13,8 +13,9 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, PointForce, forces
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, PointForce
 from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
+from magshell_fenicsx.parts.loads import forces
 
 Integral = Callable[[Expr], ufl.Form]
 

@@ -102,7 +102,7 @@ class InteractionTerm:
         """It has no sparse part; see `add_rows`."""
 
     def add_rows(self, rows: Array, factor: float) -> None:
-        """See `assembly.coupled.WholeTerm`; collective."""
+        """See `assembly.whole.WholeTerm`; collective."""
         nodes = self._nodes()
         local = self._u.function_space.dofmap.list[: len(self._cells.own)]
         k = self._cells.nodes.shape[1]

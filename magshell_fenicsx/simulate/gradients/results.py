@@ -10,7 +10,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.shell.parameters import forces
+from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.sections import MeshSurface
