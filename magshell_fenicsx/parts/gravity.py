@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 from ufl.core.expr import Expr
 
@@ -49,7 +50,7 @@ class GravityStep(PathStep):
     """What is prescribed step by step: g, or arc length, which passes its folds"""
     until: Until = "target"
     direction: list[Finite] = Field(default=[0.0, 0.0, -1.0], min_length=3, max_length=3)
-    """Along it, of any length; down e3 by default"""
+    """Its three components, of any length; by default down e3"""
     acceleration: Annotated[float, over(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
 
@@ -64,6 +65,12 @@ class GravityStep(PathStep):
     def place(self) -> Any:
         return tuple(self.direction)
 
+    @property
+    def _along(self) -> NDArray[np.float64]:
+        """The unit vector (3,); the square of 1e-200 would be zero."""
+        large = np.array(self.direction) / max(map(abs, self.direction))
+        return np.asarray(large / np.linalg.norm(large))
+
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if self.target else now.h**2
 
@@ -71,14 +78,13 @@ class GravityStep(PathStep):
         return abs(self.acceleration or now.h**2)
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
-        return [Leaves(vectors=[np.array(self.direction)])]
+        return [Leaves(vectors=[self._along])]
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        along = np.array(self.direction) / np.linalg.norm(self.direction)
-        return [OwnTerm(step.name, energy, (along,), of_volume=True)]
+        return [OwnTerm(step.name, energy, (self._along,), of_volume=True)]
 
     def account(self, step: ProgrammeStep, context: Context) -> str:
-        along = ", ".join(f"{c:.3g}" for c in np.array(self.direction) / np.linalg.norm(self.direction))
+        along = ", ".join(f"{c + 0.0:.3g}" for c in self._along)
         return f"the shell's weight along [{along}], amplitude {step.name} = ρ g R/E"
 
 
