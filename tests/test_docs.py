@@ -66,6 +66,23 @@ def test_places_in_the_code() -> None:
         assert re.search(rf"^\s*(def|class) {name}\b|^{name} = ", code, re.MULTILINE), f"{file}: {name}"
 
 
+def test_places_that_docstrings_name() -> None:
+    """Of three names or more with dots, such as `mesh.mirror.rotation`, the first that of a folder."""
+    package, gone = TOP / "magshell_fenicsx", list[str]()
+    for file in package.rglob("*.py"):
+        for name in re.findall(r"`(\w+(?:\.\w+){2,})`", text(file)):
+            room, *rest = name.split(".")
+            place = package / room
+            if not place.is_dir():
+                continue
+            while rest and not place.is_file():
+                place = place / rest[0] if (place / rest[0]).is_dir() else place / f"{rest[0]}.py"
+                rest.pop(0)
+            if not place.exists() or any(not re.search(rf"\b{each}\b", text(place)) for each in rest):
+                gone.append(f"{file.name}: {name}")
+    assert not gone
+
+
 CASE_BLOCKS = [(page, block) for page in PAGES for block in blocks(page, "yaml")]
 
 

@@ -1,14 +1,62 @@
-"""Terms whose couplings change from state to state, such as contact: their part of the tangent beside the fixed one."""
+"""Terms whose tangent has entries outside the pattern of the others: of some unknowns, or of all of them.
 
+The couplings of contact change from state to state: their entries are added to a copy of the sparse matrix. Where all
+unknowns act on each other the sum has all its entries (`assembly.whole.WholeMatrix`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import scipy
+from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.assembly.whole import WholeMatrix, WholeTerm
+
 Array = NDArray[np.float64]
 Entries: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Array]  # global rows and columns, and values
+Factors: TypeAlias = Mapping[str, float]  # of terms, by name
+
+
+class Couplings(Protocol):
+    """What some terms, times factors, add to a tangent."""
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """A sparse matrix and these terms. Collective."""
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """This rank's part of the terms' product with a vector, both with ghosts. Collective."""
+
+
+def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:
+    """Those of terms, most of which have none; `clamped` are homogeneous conditions."""
+    some = [t for t in terms if isinstance(t, Coupled)]
+    of_all = [t for t in terms if isinstance(t, WholeTerm)]
+    found: list[Couplings] = [ChangingEntries(V, some, clamped)] if some else []
+    return [*found, OfAll(WholeMatrix(V, clamped), of_all)] if of_all else found
+
+
+@dataclass(frozen=True)
+class OfAll:
+    """Those of terms in which all unknowns act on each other."""
+
+    matrix: WholeMatrix
+    terms: Sequence[WholeTerm]
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """See `Couplings`."""
+        return self.matrix.sum(K, self._among(factors))
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """See `Couplings`."""
+        return self.matrix.times(self._among(factors), v)
+
+    def _among(self, factors: Factors) -> list[tuple[float, WholeTerm]]:
+        return [(factor, t) for t in self.terms if (factor := factors.get(t.name, 0.0))]
 
 
 @runtime_checkable
@@ -19,6 +67,35 @@ class Coupled(Protocol):
 
     def entries(self) -> Entries:
         """This rank's part of d2Pi/du2, in any order; entries at the same place are added up. Collective."""
+
+
+class ChangingEntries:
+    """The entries of coupled terms."""
+
+    def __init__(self, V: fem.FunctionSpace, terms: Sequence[Coupled], clamped: Sequence[fem.DirichletBC]) -> None:
+        self._terms, self._comm = terms, V.mesh.comm
+        self._own = slice(*(3 * at for at in V.dofmap.index_map.local_range))
+        held = np.zeros(self._own.stop - self._own.start, dtype=bool)
+        for bc in clamped:
+            dofs = bc.dof_indices()[0]
+            held[dofs[dofs < len(held)]] = True
+        self._fixed = np.concatenate(self._comm.allgather(held))
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """See `Couplings`; K itself if there are no entries."""
+        entries = self._entries(factors)
+        return with_entries(K, entries, self._fixed) if entries else K
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """See `Couplings`."""
+        found, size = np.zeros_like(v), self._own.stop - self._own.start
+        if entries := self._entries(factors):
+            parts = times(entries, np.concatenate(self._comm.allgather(v[:size])))
+            found[:size] = self._comm.allreduce(parts)[self._own]
+        return found
+
+    def _entries(self, factors: Factors) -> list[tuple[float, Entries]]:
+        return [(factor, t.entries()) for t in self._terms if (factor := factors.get(t.name, 0.0))]
 
 
 def with_entries(K: PETSc.Mat, entries: list[tuple[float, Entries]], fixed: NDArray[np.bool_]) -> PETSc.Mat:

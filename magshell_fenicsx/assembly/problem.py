@@ -16,13 +16,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.coupled import Coupled, Entries, times, with_entries
+from magshell_fenicsx.assembly.coupled import couplings
 from magshell_fenicsx.assembly.evaluated import Evaluated, Noise
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
-from magshell_fenicsx.assembly.whole import WholeMatrix, WholeTerm
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.platform import compat
@@ -95,12 +94,10 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
-        self._coupled = [t for t in terms if isinstance(t, Coupled)]
+        self._couplings = couplings(V, terms, clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
-        self._of_all = [t for t in terms if isinstance(t, WholeTerm)]
-        self._whole = WholeMatrix(V, clamped) if self._of_all else None
         self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
         for term in self._own_residual:
             term.compile_residual()
@@ -266,16 +263,9 @@ class FiniteElementSystem:
             given, found = K.createVecRight(), np.zeros_like(v)
             given.array[:] = v[: self.size]
             found[: self.size] = (K * given).array
-        if entries := self._entries(factors):
-            whole = self.comm.allreduce(times(entries, np.concatenate(self.comm.allgather(v[: self.size]))))
-            first = 3 * self.u.function_space.dofmap.index_map.local_range[0]
-            found[: self.size] += whole[first : first + self.size]
-        if self._whole:
-            found = found + self._whole.times(self._among(factors), v)
+        for each in self._couplings:
+            found = found + each.times(v, factors)
         return found
-
-    def _entries(self, factors: Mapping[str, float]) -> list[tuple[float, Entries]]:
-        return [(factor, t.entries()) for t in self._coupled if (factor := factors.get(t.name, 0.0))]
 
     def _tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
@@ -285,22 +275,14 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
-        if entries := self._entries(factors):
-            fixed = np.zeros(self.size, dtype=bool)
-            fixed[self._fixed] = True
-            K = with_entries(K, entries, np.concatenate(self.comm.allgather(fixed)))
-        if self._whole:
-            K = self._whole.sum(K, self._among(factors))
+        for each in self._couplings:
+            K = each.sum(K, factors)
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
         N = self._skew(factors)
         return Skewed(K, N) if N else K
-
-    def _among(self, factors: Mapping[str, float]) -> list[tuple[float, WholeTerm]]:
-        """The terms that couple all unknowns, with their factors."""
-        return [(factor, t) for t in self._of_all if (factor := factors.get(t.name, 0.0))]
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""

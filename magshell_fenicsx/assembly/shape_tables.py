@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.point_kernels import Pair
 from magshell_fenicsx.platform import compat
 
+Array = NDArray[np.float64]
 PARTS = 6  # value, two first and three second derivatives
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 EDGES = ((1, 2), (0, 2), (0, 1))
@@ -30,10 +31,10 @@ class Table:
         (points, 6, functions): the shape functions, their derivatives by X, Y, XX, XY, YY.
     """
 
-    values: NDArray[np.float64]
+    values: Array
 
     @classmethod
-    def tabulate(cls, element: basix.finite_element.FiniteElement, X: NDArray[np.float64]) -> "Table":
+    def tabulate(cls, element: basix.finite_element.FiniteElement, X: Array) -> "Table":
         return cls(np.ascontiguousarray(element.tabulate(2, X)[..., 0].transpose(1, 0, 2)))
 
     @cached_property
@@ -41,58 +42,55 @@ class Table:
         """Pairs a <= b of functions."""
         return np.triu_indices(self.values.shape[2])
 
-    def jets(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jets(self, nodal: Array) -> Array:
         """(entities, points, 6, 3) from nodal vectors (entities, functions, 3)."""
         points, parts, functions = self.values.shape
         jets = np.matmul(self.values.reshape(-1, functions), nodal)
         return np.asarray(jets.reshape(len(nodal), points, parts, 3))
 
-    def symmetric(self, w: NDArray[np.float64], pairs: tuple[Pair, ...]) -> NDArray[np.float64]:
+    def symmetric(self, w: Array, pairs: tuple[Pair, ...]) -> Array:
         """w (D_i D_j + D_j D_i) of functions a <= b, (points * pairs, functions (functions + 1)/2); once if i = j."""
         a, b = self.triangle
         D = self.values
         products = [D[:, i, a] * D[:, j, b] + (i < j) * D[:, j, a] * D[:, i, b] for i, j in pairs]
         return _flat(w, products)
 
-    def skew(self, w: NDArray[np.float64], pairs: tuple[Pair, ...]) -> NDArray[np.float64]:
+    def skew(self, w: Array, pairs: tuple[Pair, ...]) -> Array:
         """w (D_i D_j - D_j D_i) of functions a <= b, (points * pairs, functions (functions + 1)/2)."""
         a, b = self.triangle
         D = self.values
         return _flat(w, [D[:, i, a] * D[:, j, b] - D[:, j, a] * D[:, i, b] for i, j in pairs])
 
-    def cross(self, w: NDArray[np.float64], other: "Table", pairs: tuple[Pair, ...]) -> NDArray[np.float64]:
+    def cross(self, w: Array, other: "Table", pairs: tuple[Pair, ...]) -> Array:
         """w D_i D'_j of all functions a here and b there, (points * pairs, functions^2)."""
         products = [self.values[:, i, :, None] * other.values[:, j, None, :] for i, j in pairs]
         return _flat(w, [p.reshape(len(p), -1) for p in products])
 
 
-def _flat(w: NDArray[np.float64], products: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _flat(w: Array, products: list[Array]) -> Array:
     stacked = w[:, None, None] * np.stack(products, axis=1)
     return np.ascontiguousarray(stacked.reshape(-1, stacked.shape[2]))
 
 
-def cell_rule(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def cell_rule(degree: int) -> tuple[Array, Array]:
     """Points (q, 2) and weights (q,), which sum to the reference triangle's area."""
     points, weights = basix.make_quadrature(basix.CellType.triangle, degree)
     return np.asarray(points), np.asarray(weights)
 
 
-def edge_rule(degree: int, edge: int, backwards: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def edge_rule(degree: int, edge: int, backwards: bool) -> tuple[Array, Array]:
     """Points (q, 2) on an edge, from its first corner or from its last, and weights that sum to one."""
     x, weights = basix.make_quadrature(basix.CellType.interval, degree)
     start, end = CORNERS[list(EDGES[edge][:: -1 if backwards else 1])]
     return start + np.asarray(x) * (end - start), np.asarray(weights)
 
 
-def edge_covector(edge: int) -> NDArray[np.float64]:
+def edge_covector(edge: int) -> Array:
     """(2,), zero along an edge, positive outward and as long as the edge."""
     start, end = CORNERS[list(EDGES[edge])]
     along = end - start
     m = np.array([along[1], -along[0]])
     return m if m @ (CORNERS.mean(axis=0) - start) < 0 else -m
-
-
-Array = NDArray[np.float64]
 
 
 def cell_frames(domain: mesh.Mesh) -> Array:

@@ -142,7 +142,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
-    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies)
+    all_loads = replace(_loads(case, modelled), own=tuple(term.turned(turn) for term in energies), contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"

@@ -113,7 +113,7 @@ class Averaged(Protocol):
 
 
 class Ground(Protocol):
-    """Supports that move; see `parts.motion.mass`.
+    """Supports that move; see `shells.mass`.
 
     Attributes
     ----------

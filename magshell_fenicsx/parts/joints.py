@@ -5,7 +5,7 @@ cells, which C0 interior penalty has on every one: of a rigid joint it is that, 
 spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle theta between the normals.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
+from magshell_fenicsx.parts.course import Course, Target
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -85,9 +85,7 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         """See that the edges are of several shells, each joined once, and that all else goes with joints."""
         if not context.sections.get("shells"):
             raise ValueError("joints: join edges of several shells: give shells")
-        context.needs("joints", "a mid-surface")
-        if context.shell.viscosity is not None or context.shell.relaxation:
-            raise ValueError("joints: with viscosity or relaxation they are not built: leave these out")
+        context.needs("joints", "a mid-surface", "a material without viscosity")
         taken = set[str]()
         for i, section in enumerate(self.given):
             if section.stiffness:
@@ -123,10 +121,11 @@ def _words(joint: Joint) -> str:
     return f"{' and '.join(joint.edges)} joined {kind}"
 
 
-class FoldStep(PathStep):
+class FoldStep(FactorStep):
     """The angles at which springs of joints rest grow from those of the shells where they are (0) to their own (1)."""
 
     amplitude: ClassVar[str] = AMPLITUDE
+    section: ClassVar[str] = "joints"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(AMPLITUDE, "fold", "How far the rest angles of joints have grown to those of the case.", "load"),
@@ -134,45 +133,23 @@ class FoldStep(PathStep):
     kind: Literal["fold"]
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: the factor, or arc length, which passes its folds"""
-    until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of the factor, 1 by default"""
 
-    @property
-    def _end(self) -> float | None:
-        return 1.0
-
     @classmethod
-    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        driven = loading is not None and loading.amplitude == cls.amplitude
-        return [] if driven or not rests_elsewhere(context) else [("joints", FoldBefore(kind="fold"))]
+    def asked_for(cls, context: Context) -> bool:
+        """Whether a spring has an angle of its own."""
+        return any(section.angle is not None for section in context.sections.get("joints") or ())
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        if not rests_elsewhere(context):
+        if not self.asked_for(context):
             raise ValueError(f"{step.key}.kind: fold: needs a joint with an angle")
 
-
-class FoldBefore(FoldStep):
-    """The growth before the one load of a case; it ends at the first instability."""
-
-    def drive(self, now: Now) -> Drive:
-        return Drive("arc", "load", 1.0, [1.0], 0.5, 1.0)
-
-    def course(self, here: Here) -> Course:
-        course = super().course(here)
-
-        def forbidden(mu: Mapping[str, float], what: str) -> str:
-            return (
-                f"the springs of joints alone make the shells unstable at {mu[AMPLITUDE]:.9g} of their angles "
-                f"({what}): to go on, take these as a load, kind: fold"
-            )
-
-        return replace(course, until="limit", forbidden=forbidden)
-
-
-def rests_elsewhere(context: Context) -> bool:
-    """Whether a spring has an angle of its own."""
-    return any(section.angle is not None for section in context.sections.get("joints") or ())
+    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+        return (
+            f"the springs of joints alone make the shells unstable at {value:.9g} of their angles "
+            f"({what}): to go on, take these as a load, kind: fold"
+        )
 
 
 class FoldSeen(Seen):

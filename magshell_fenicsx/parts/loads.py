@@ -1,12 +1,21 @@
 """All that loads a shell: what the parts of a problem add up to, dimensionless."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import DeadLoad, Force, Move
+from magshell_fenicsx.models.shell.parameters import (
+    AreaForce,
+    DeadLoad,
+    EdgeForce,
+    EdgeMoment,
+    Force,
+    Move,
+    PointForce,
+    Potential,
+)
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.bodies.contact import Contact
@@ -67,3 +76,18 @@ class Loads:
     def displaced(self) -> str | None:
         """The amplitude with the displacement that the column w_over_h has; None if that is the pole's."""
         return next(iter((*self.forces, *self.dead)), None)
+
+
+def moments(loads: Iterable[DeadLoad]) -> list[EdgeMoment]:
+    """The moments among dead loads."""
+    return [load for load in loads if isinstance(load, EdgeMoment)]
+
+
+def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
+    """The energies of those that depend on the deformed place."""
+    return [load.term for load in loads if isinstance(load, Potential)]
+
+
+def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
+    """All others: their work is their size times a displacement along themselves."""
+    return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]

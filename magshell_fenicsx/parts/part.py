@@ -77,6 +77,18 @@ class Context:
 
         return abilities_of(self)
 
+    @property
+    def withdrawn(self) -> "dict[Offer, str]":
+        """What the case has not, of what abilities may need -> what to do."""
+        found = dict[Offer, str]()
+        for ability in self.abilities:
+            found |= ability.withdraws(self)
+        if self.solid:
+            found["a mid-surface"] = "a solid has none: take model: shell"
+        if self.shell.thickness_factor is not None:
+            found["the same thickness everywhere"] = "leave out shell.thickness_factor"
+        return found
+
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
         """See that the case has what a key needs.
 
@@ -90,13 +102,7 @@ class Context:
         ValueError
             With the first of the offers that is not there.
         """
-        withdrawn = dict[Offer, str]()
-        for ability in self.abilities:
-            withdrawn |= ability.withdraws(self)
-        if self.solid:
-            withdrawn["a mid-surface"] = "a solid has none: take model: shell"
-        if self.shell.thickness_factor is not None:
-            withdrawn["the same thickness everywhere"] = "leave out shell.thickness_factor"
+        withdrawn = self.withdrawn
         for offer in offers:
             if offer in withdrawn:
                 raise ValueError(f"{key}: needs {offer}; {hint or withdrawn[offer]}")
@@ -237,6 +243,7 @@ Offer = Literal[
     "the same thickness everywhere",
     "a thickness that does not change",
     "the area as drawn",
+    "a material without viscosity",
 ]
 
 

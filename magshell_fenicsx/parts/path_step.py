@@ -1,9 +1,11 @@
 """The base of the steps that follow a path: their controls, targets, and what comes after an instability."""
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import is_over_unit, over_unit
 from magshell_fenicsx.parts.course import (
@@ -19,9 +21,6 @@ from magshell_fenicsx.parts.course import (
 )
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import LEAST_TARGET, Step
-
-if TYPE_CHECKING:
-    pass
 
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
 
@@ -183,7 +182,11 @@ class PathStep(Step):
     def course(self, here: Here) -> Course:
         until = "target" if self.until == "zero" else self.until
         steps = self.points if until == "points" else None
-        return Course(self.drive(here.now()), until, steps, self.curves(here))
+        return Course(self.drive(self.now(here)), until, steps, self.curves(here))
+
+    def now(self, here: Here) -> Now:
+        """Its amplitude where it begins."""
+        return here.now()
 
     @property
     def branch_points(self) -> int:
@@ -204,3 +207,60 @@ class PathStep(Step):
     def scale(self, now: Now) -> float:
         """An amplitude that counts as of order one in the arc length."""
         return 1.0
+
+
+class FactorStep(PathStep):
+    """The base of what grows to a factor, 1 by default.
+
+    Where no step drives it, it grows before the one load of a case, up to the first instability at most.
+
+    Attributes
+    ----------
+    section
+        Key of the case that asks for it.
+    label
+        Of its points before the load, see `Course`.
+    """
+
+    section: ClassVar[str]
+    label: ClassVar[Literal["", "field"]] = ""
+    control: Literal["load", "arc"] = "arc"
+    until: Until = "target"
+    _alone: bool = PrivateAttr(default=False)
+
+    @property
+    def _end(self) -> float | None:
+        return 1.0
+
+    @classmethod
+    def asked_for(cls, context: Context) -> bool:
+        """Whether the case has what grows."""
+        raise NotImplementedError
+
+    @classmethod
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
+        if driven or not cls.asked_for(context):
+            return []
+        (kind,) = get_args(cls.model_fields["kind"].annotation)
+        step = cls.model_validate({"kind": kind})
+        step._alone = True
+        return [(cls.section, step)]
+
+    def drive(self, now: Now) -> Drive:
+        size = now.size
+        return Drive("arc", "load", size, [size], size / 2, size) if self._alone else super().drive(now)
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+        if not self._alone:
+            return course
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            return self.unstable_alone(mu[self.amplitude], course, what)
+
+        return replace(course, until="limit", forbidden=forbidden, label=self.label)
+
+    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+        """What is said of an instability before the load, at a value of the amplitude."""
+        raise NotImplementedError

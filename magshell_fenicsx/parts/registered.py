@@ -35,6 +35,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "source": "magnetism.source_step.SourceStep",
     "time": "motion.step.TimeSection",
     "spin": "spin.SpinStep",
+    "gravity": "gravity.GravityStep",
     "interaction": "magnetism.interaction.InteractionStep",
     "fold": "joints.FoldStep",
 }

@@ -29,7 +29,8 @@ def sizes_in_units(problem: Problem) -> Sizes:
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:
     """Amplitudes that have columns of their own name, of rooms and of one's own energies, with initial values."""
-    grown, terms = {name: 0.0 for room in SEEN for name in room.named(loads)}, loads.own
+    grown = {name: 0.0 for room in SEEN for name in room.named(loads)}
+    terms = [term for term in loads.own if term.density]
     return grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
 
 

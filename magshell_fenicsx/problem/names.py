@@ -31,13 +31,13 @@ def surface_terms(context: Context, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ..
     found = []
     for key, part in parts_of(context).items():
         for term in part.terms(context.scales):
-            if not LEAST <= abs(term.value) <= MOST:
+            if term.density and not LEAST <= abs(term.value) <= MOST:
                 raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
             found.append(term)
     for step in {step.name: step for step in context.steps}.values():
         found += step.load.terms(step, context)
     found += own
-    names = [name for term in found for name in (term.name, *term.observed)]
+    names = [name for term in found for name in ((term.name,) if term.density else ()) + tuple(term.observed)]
     names += {p.name for term in found for p in term.free}
     for name in names:
         if name in TAKEN or names.count(name) > 1:

@@ -72,7 +72,7 @@ class Unit:
     needs
         What a case must have for such a text.
     words, symbol
-        Of the column in that unit, if they are not those of the quantity.
+        Of the column in that unit, if they are not those of the quantity; one without a symbol gets none.
     """
 
     key: str
@@ -275,7 +275,7 @@ class Quantity:
         """The column in the unit that is shown for one of its units."""
         stem, symbol = self.stem or self.name.replace("_over_h", ""), re.split("[ /]", self.symbol)[0]
         words = self.words if unit.words is None else unit.words
-        symbol = symbol if unit.symbol is None else unit.symbol
+        symbol = symbol if unit.symbol is None or not symbol else unit.symbol
         shown = Unit(unit.shown, unit.shown)
         return replace(self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,))
 

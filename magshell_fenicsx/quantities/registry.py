@@ -217,6 +217,10 @@ def quantity(name: str) -> Quantity:
         return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
+    numbered = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
+    first = QUANTITIES.get(numbered[1]) if numbered else None
+    if numbered and first and first.kind == "load":
+        return replace(first, name=name, words=f"{first.words} {numbered[2]}", symbol="")
     if several := [q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)]:
         longest = max(several, key=lambda q: len(q.name))
         return longest.of(name.removeprefix(f"{longest.name}_"))

@@ -309,6 +309,7 @@ def _between(grid: Grid, sector: Sector) -> Grid:
 
 
 def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:
+    """The planes as those of the halves on both of their sides."""
     return [half for plane in planes for half in (plane, plane.reversed)]
 
 

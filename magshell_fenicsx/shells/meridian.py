@@ -21,11 +21,11 @@ from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential, default_penalty
+from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
-from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import meridian_openings
@@ -173,7 +173,7 @@ class MeridianModel(Thin):
             self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
-            if not all(isinstance(load, EdgeMoment | Potential) for load in dead):
+            if forces(dead):
                 energy, self.load_size[name] = dead_loads(name, dead, around, self.kernels)
                 self.energies.append(energy)
             self.energies += factory.dead_energies(name, dead, meridian.ends)

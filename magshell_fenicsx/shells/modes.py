@@ -139,7 +139,7 @@ class ShellModes:
         Raises
         ------
         ModesNotFound
-            See `solve.stability.null_vector`.
+            See `continuation.modes.null_vector`.
         """
         label = label if label.startswith(EXCLUDED) else ""
         family = next(family for family in _families(self.model) if family.label == label)

@@ -209,7 +209,7 @@ class Thin(Observed):
     def own_and_contacts(self, edges: Mapping[str, Facets]) -> list[Energy]:
         """The energies of one's own terms and of bodies; sets what is observed of them."""
         factory, own = self.factory, [(term, edges[term.on] if term.on else None) for term in self.loads.own]
-        energies = [factory.own(term, facets) for term, facets in own]
+        energies = [factory.own(term, facets) for term, facets in own if term.density]
         self.observed = self.kernels.compile_all(factory.observed(term, facets) for term, facets in own)
         if self.loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])

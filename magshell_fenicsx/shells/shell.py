@@ -232,7 +232,7 @@ class ShellModel(Thin):
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
         if loads.interaction:
-            terms.append(InteractionTerm(self, self.u, loads.interaction))
+            terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
@@ -285,9 +285,8 @@ class ShellModel(Thin):
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
-        for each in terms:
-            if isinstance(each, InteractionTerm):  # now that all is there which it reads
-                each.refuse_near()
+        if loads.interaction:
+            interacting.refuse_near()  # now that all is there which it reads
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | UnfoldedModes | None:

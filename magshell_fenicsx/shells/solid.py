@@ -27,12 +27,12 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Material, Potential
+from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
 from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
-from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.loads import Loads, moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import Shape, body_shape, growth_in_body
@@ -123,7 +123,7 @@ class SolidModel(Observed):
         if loads.pressure:
             potential = not self.without_potential
             self._terms += factory.pressure(material.classical_pressure, potential=potential)
-        self._terms += [factory.own(term) for term in loads.own]
+        self._terms += [factory.own(term) for term in loads.own if term.density]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])
@@ -135,11 +135,11 @@ class SolidModel(Observed):
         for name, dead in loads.dead.items():
             assert on
             self._terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
-            moments = [load for load in dead if isinstance(load, EdgeMoment)]
             self._terms += [
-                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name) for i, m in enumerate(moments)
+                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
+                for i, m in enumerate(moments(dead))
             ]
-            self._terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
+            self._terms += [factory.own(term, name) for term in potentials(dead)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)

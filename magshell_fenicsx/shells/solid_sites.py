@@ -1,6 +1,6 @@
 """Where the solid's terms live: the Hessians of their densities at points, contracted in batches.
 
-As on the shell (see `shell.sites`), with the jets in reference coordinates: the tables of the shape
+As on the shell (see `models.shell.sites`), with the jets in reference coordinates: the tables of the shape
 functions are the same for all cells.
 """
 
@@ -82,7 +82,7 @@ class Site:
         self._contraction = Contraction(rule, self._coupled)
 
     def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
-        """Add the terms' element matrices to `same`; see `shell.sites.Site.add`."""
+        """Add the terms' element matrices to `same`; see `models.shell.sites.Site.add`."""
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:

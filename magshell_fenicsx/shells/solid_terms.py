@@ -197,6 +197,7 @@ class TermFactory:
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
         """The energy of a part or one's own on the outer face or of the body, with its own amplitude or another."""
+        assert term.density
         if term.of_volume:
             return self._bulk(term.name, self._inside(term, term.density), amplitude or term.name, linear=term.linear)
         density = self._surface(term, term.density)

@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import DeadLoad, EdgeMoment, Material, Potential
+from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 from magshell_fenicsx.parts.bodies.contact import (
@@ -42,6 +42,7 @@ from magshell_fenicsx.parts.bodies.contact import (
 from magshell_fenicsx.parts.gap import thinning
 from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
 from magshell_fenicsx.parts.joints import Creases
+from magshell_fenicsx.parts.loads import moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
@@ -160,12 +161,11 @@ class EnergyFactory:
 
     def dead_energies(self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]) -> list[Energy]:
         """The moments and one's own potentials among the dead loads of an amplitude."""
-        moments = [load for load in loads if isinstance(load, EdgeMoment)]
         turning = [
             self.edge_moment(f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name)
-            for i, load in enumerate(moments)
+            for i, load in enumerate(moments(loads))
         ]
-        return turning + [self.own(load.term, amplitude=name) for load in loads if isinstance(load, Potential)]
+        return turning + [self.own(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
@@ -282,6 +282,7 @@ class EnergyFactory:
 
     def own(self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; `facets` of a term's edge."""
+        assert term.density
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
         density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)

@@ -232,7 +232,7 @@ def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class WavesOf:
-    """The waves of one number m; a `solve.watch.Family`."""
+    """The waves of one number m; a `continuation.watch.Family`."""
 
     waves: Waves
     m: int

@@ -271,7 +271,7 @@ class Scene:
             **{name: state.mu[name] for name in self._own_amplitudes},
             **{column: value for room in SEEN for column, value in room.observe(sight, state).items()},
             **{
-                column: state.mu[term.name]
+                column: (state.mu[term.name] if term.density else 1.0)
                 * model.multiplicity
                 * model.system.at(state).integral(model.observed[column])
                 for term in self.problem.loads.own

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
+from math import inf
 
 import numpy as np
 import scipy
@@ -12,7 +13,6 @@ from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.bodies.contact import Contact
-from magshell_fenicsx.parts.bodies.press import ContactSection
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.simulate.record import Stopped
@@ -35,18 +35,18 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    load, name, h = step.load, step.name, scene.problem.material.h
-    assert isinstance(load, ContactSection)
+    goal, name, h = step.load.target, step.name, scene.problem.material.h
+    end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
     region = scene.model.region(state, name)
-    if region.penetration > NEAR * h or (load.approach is not None and load.approach <= state.mu[name]):
+    if region.penetration > NEAR * h or end <= state.mu[name]:
         return state
     for _ in range(MOST):
         gap = -scene.model.region(state, name).penetration / h
         if gap <= NEAR:
             break
         state = state.with_(state.u, name, state.mu[name] + gap)
-        if load.approach is not None and state.mu[name] + DEEP[0] >= load.approach:
-            return state.with_(state.u, name, load.approach)
+        if state.mu[name] + DEEP[0] >= end:
+            return state.with_(state.u, name, end)
     else:
         raise Stopped("the body does not meet the shell")
     reason = ""

@@ -138,7 +138,7 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def moments(values: Array) -> dict[str, Any]:
-    """Mean, standard deviation and quartiles; None where there are too few values."""
+    """Mean, standard deviation, least, middle and largest value; None where there are too few."""
     if not len(values):
         return dict.fromkeys(("mean", "deviation", "least", "median", "largest"))
     return {

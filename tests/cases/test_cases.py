@@ -169,6 +169,13 @@ def test_clamped_plate() -> None:
     assert found.rows[-1]["w_pole_over_h"] == pytest.approx(w0_over_h, rel=1e-4)
 
 
+def test_standing_strip() -> None:
+    """Greenhill's column: g = 9/4 j² E h²/(12 ρ L³), j the first zero of J₋⅓."""
+    found = result("standing_strip.yaml", "shell.poisson_ratio=0", "loading.then=null", "loading.acceleration=null")
+    (row,) = [row for row in found.rows if row["label"] == "bifurcation"]
+    assert row["gravity_m_per_s2"] == pytest.approx(7.8373 * 1e6 * 1e-3**2 / (12 * 1100 * 0.05**3), rel=2e-3)
+
+
 def test_spinning_blade() -> None:
     """SciPy's boundary values of an extensible elastica: how deep its tip hangs at rest and at 300 rpm."""
     found = result("spinning_blade.yaml", "shell.poisson_ratio=0", "loading.1.points=2")

@@ -268,6 +268,8 @@ def test_captions_tell_the_load() -> None:
     row |= {"field_angle": 45.0, "amplitude": "force", "force": 2.5, "w_over_h": 7.0}
     assert caption(0.01, 0.3, row).count("45") == 1
     assert "$F R/(2\\pi D)$ = 2.5, $w/h$ = 7 at the load" in caption(0.01, 0.3, row)
+    row |= {"gravity": 1e-4, "gravity_m_per_s2": 9.81}
+    assert caption(0.01, 0.3, row, ["force", "gravity"]).endswith("$w/h$ = 7, $g$ = 9.81 m/s²")
 
 
 def test_names_are_no_mathematics() -> None:

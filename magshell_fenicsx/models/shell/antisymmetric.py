@@ -55,7 +55,7 @@ def antisymmetric_edge(
 
 
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a `solve.watch.Family`.
+    """The tangent of the modes that a half model excludes; a `continuation.watch.Family`.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ class TangentSite(Protocol):
 
 
 class FastTangent:
-    """The tangent of a sum of terms; an `assemblers.TangentAssembler`.
+    """The tangent of a sum of terms; a `assembly.terms.TangentAssembler`.
 
     Parameters
     ----------

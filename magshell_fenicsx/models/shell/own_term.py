@@ -21,7 +21,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
 from magshell_fenicsx.input.expressions import function
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.mirror import Y0, Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
 from magshell_fenicsx.shape.symmetry import Leaves, mirrors_formula
@@ -62,15 +62,22 @@ class ByPlace:
         The formula.
     key
         That of the case file, for messages.
+    turn
+        The frame of the model is turned about e3 by it (rad), the formula's is not.
     """
 
     text: str
     key: str
+    turn: float = 0.0
 
     @property
     def of_place(self) -> "Callable[[Array, Array, Array], Array]":
-        """The formula as a function of arrays."""
-        return function(self.text)
+        """The formula as a function of arrays of coordinates in the model's frame."""
+        of_case = function(self.text)
+        if not self.turn:
+            return of_case
+        Q = rotation(self.turn)
+        return lambda x, y, z: of_case(*(Q[0, i] * x + Q[1, i] * y + Q[2, i] * z for i in range(3)))
 
     def turns(self, outline: "Outline") -> bool:
         """Whether it is the same all around e3."""
@@ -96,7 +103,8 @@ class OwnTerm:
         Of (r0, u, *parameters): jets of the placement and of the displacement (see `kinematics.Jet`; r = r0 + u),
         lengths in R, to a UFL scalar in E h per undeformed area. It must not depend on the coordinates that the
         jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
-        the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
+        the first derivatives of u; an energy of its second derivatives would miss the rotations between cells. None:
+        it has no energy and only observes, also second derivatives.
     parameters
         Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can. A
         dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place;
@@ -104,14 +112,16 @@ class OwnTerm:
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
-        Column -> density as above; mu times its integral over the whole shell is observed along a path. A model has
-        only the symmetries that these leave too.
+        Column -> density as above; mu times its integral over the whole shell is observed along a path, the integral
+        itself without an energy. A model has only the symmetries that these leave too.
     of_volume
         Whether the densities are those of a volume, over E: the thickness multiplies them where it varies, and a solid
         has them in all of its body. They depend on the places r0.r and u.r alone.
     on
         Name of an edge. The densities are then in E h R per undeformed length of it, and take a `kinematics.Edge` after
         the jets: its outward conormal, and derivatives along this and by arc length. A solid has no such energies.
+    key
+        That of the case file with this name, for messages.
 
     Raises
     ------
@@ -120,12 +130,13 @@ class OwnTerm:
     """
 
     name: str
-    density: Callable[..., Expr]
+    density: Callable[..., Expr] | None
     parameters: tuple[float | Array | Free | GivenField | ByPlace | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
     on: str | None = None
+    key: str = ""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -134,6 +145,10 @@ class OwnTerm:
             raise ValueError(f"{self.name}: value: {self.value!r}: must be a finite number")
         if not isinstance(self.on, str | None):
             raise ValueError(f"{self.name}: on: {self.on!r}: must be the name of one edge")
+        if not self.densities:
+            raise ValueError(f"{self.name}: has neither a density nor anything that it observes")
+        if self.density is None and (self.free or self.value):
+            raise ValueError(f"{self.name}: only observes: a value or a Free parameter needs a density")
         if self._symbolic.W.ufl_shape:
             raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}")
         if strangers := self._strangers():
@@ -141,9 +156,9 @@ class OwnTerm:
                 f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
                 "The position is r0.r, a number that is the same everywhere goes into the parameters"
             )
-        if not self.parts:
+        if self.density and not self.parts:
             raise ValueError(f"{self.name}: the density does not depend on the displacement")
-        if curved := [part for part in self.parts if part in SECOND]:
+        if self.density and (curved := [part for part in self.parts if part in SECOND]):
             raise ValueError(
                 f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; without a term on "
                 "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
@@ -154,6 +169,11 @@ class OwnTerm:
         bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
+
+    @property
+    def densities(self) -> "tuple[Callable[..., Expr], ...]":
+        """Its energy's, if it has one, then those that it observes."""
+        return (*((self.density,) if self.density else ()), *self.observed.values())
 
     @cached_property
     def parts(self) -> tuple[str, ...]:
@@ -191,6 +211,34 @@ class OwnTerm:
             return carried(p) if carried and isinstance(p, GivenField) else p
 
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
+
+    def turned(self, angle: float) -> "OwnTerm":
+        """The same in a frame that is turned about e3 (rad)."""
+        if not angle or (self.turns and not self.by_place):
+            return self
+
+        def back(v: Expr, about: Expr) -> Expr:
+            (c, s), (x, y, z) = (about[0], about[1]), (v[0], v[1], v[2])
+            return ufl.as_vector([c * x - s * y, s * x + c * y, z])
+
+        def in_frame(density: Callable[..., Expr]) -> Callable[..., Expr]:
+            def of(r0: Jet, u: Jet, *others: Any) -> Expr:
+                *rest, about = others
+                jets = (Jet(*(back(part, about) for part in jet.parts())) for jet in (r0, u))
+                if self.on is not None:
+                    edge, *rest = rest
+                    rest = [replace(edge, outward=back(edge.outward, about), along=back(edge.along, about)), *rest]
+                return density(*jets, *rest)
+
+            return of
+
+        parameters = (replace(p, turn=angle) if isinstance(p, ByPlace) else p for p in self.parameters)
+        return replace(
+            self,
+            density=in_frame(self.density) if self.density else None,
+            parameters=(*parameters, np.array([np.cos(angle), np.sin(angle)])),
+            observed={column: in_frame(density) for column, density in self.observed.items()},
+        )
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density that takes a function of one number as a vector of one."""
@@ -238,18 +286,11 @@ class OwnTerm:
         return all(self._same(sample, image(*sample)) for sample in _random_samples())
 
     def leaves(self, outline: "Outline") -> Leaves:
-        """The symmetry that it leaves.
-
-        The frame of a half of what is round is turned to its plane: a term that does not turn stays behind.
-        """
-
+        """The symmetry that it leaves."""
         turns = self.turns and all(p.turns(outline) for p in self.by_place)
 
         def mirrors(mirror: Mirror) -> bool:
-            turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
-            if turned and not turns:
-                return False
-            return self.mirrored(Y0 if turned else mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
+            return self.mirrored(mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
 
         shared, name = self.mirrored(Y0) and turns, self.name + (" or what it observes" if self.observed else "")
         return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
@@ -257,7 +298,7 @@ class OwnTerm:
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(sample, self.density) for sample in _random_samples()]
+        values = [self._value(sample, self.densities[0]) for sample in _random_samples()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
@@ -274,7 +315,7 @@ class OwnTerm:
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
         m = ufl.Coefficient(ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,))))
         try:
-            return Symbolic(self._at(r0, u, m, self.density), r0, u, m)
+            return Symbolic(self._at(r0, u, m, self.densities[0]), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
             said = f"{type(e).__name__}: {e}"
             taken = "r0, u" if self.on is None else "r0, u, an edge"
@@ -307,7 +348,7 @@ class OwnTerm:
 
     def _same(self, *samples: "Sample") -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
-        for density in (self.density, *self.observed.values()):
+        for density in self.densities:
             here, there = (self._value(sample, density) for sample in samples)
             if not abs(here - there) <= SAME * max(abs(here), abs(there)):  # nan: no symmetry is known
                 return False

@@ -134,7 +134,7 @@ class NaturalFrame:
 
     @classmethod
     def of(cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float) -> "NaturalFrame":
-        """From the tensors of `natural.Natural.at`, times R, and the amplitudes."""
+        """From the tensors of `parts.natural.shape.Natural.at`, times R, and the amplitudes."""
         t0 = frame.t
         inside = [np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)]
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)

@@ -194,7 +194,8 @@ def _seen(formulas: Together, parts: Parts, look: Look, lattice: Lattice) -> _Se
     bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[:, None]
     bulge = np.where(bulge > ROUNDING, bulge, 0.0)
     least, most, bent = formulas.bounds(low - bulge, high + bulge)
-    f = formulas.values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
+    values = formulas.values(x.reshape(-1, 3))
+    f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
     most, least = (np.clip(v, -LARGEST, LARGEST) for v in (most, least))
     between = np.minimum(np.maximum(most - least - BOTH * np.ptp(f, axis=1), 0.0), bent / lattice.count)

@@ -59,7 +59,7 @@ def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Exp
 
 
 def swept(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0) -> Expr:
-    """As `shell.densities.swept`: the volume that a face sweeps, per area of its coordinates."""
+    """As `models.shell.densities.swept`: the volume that a face sweeps, per area of its coordinates."""
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
 
@@ -88,7 +88,7 @@ def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity
     """-Pi of a moment per length about t: intensity times the mean angle that lines along n have turned.
 
     With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a traction linear in z.
-    `past` is that of `shell.edges.turning`.
+    `past` is that of `models.shell.edges.turning`.
     """
     line = n + ufl.dot(H, n)
     sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)

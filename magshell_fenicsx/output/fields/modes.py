@@ -33,7 +33,7 @@ COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
 class Mode(Protocol):
-    """What a mode's files need; see `models.modes.ShellMode`."""
+    """What a mode's files need; see `shells.modes.ShellMode`."""
 
     @property
     def label(self) -> str: ...

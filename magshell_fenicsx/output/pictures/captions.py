@@ -1,24 +1,23 @@
 """Numbers and captions under pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # takes long to import
-    from matplotlib.axes import Axes
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
 
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.axes import Axes
+
 Array = NDArray[np.float64]
-WIDE, TALL, APART = (
-    0.6,
-    0.95,
-    5.0,
-)  # of a figure, over the font's size; from a mark to the middle of its number, in points
+WIDE, TALL = 0.6, 0.95  # a digit, over the size of the font
+APART = 4.0  # between a mark and its number, in points
+NAMED = ("lambda_m", "field_angle", "p_over_pc", "force", "load_factor", "time")  # in captions where they are not zero
 AWAY = [(-1, 1), (1, 1), (-1, -1), (1, -1), (0, 1.3), (0, -1.3), (-1.3, 0), (1.3, 0)]  # the preferred first
 MARK = 3.0  # half the size of a mark, in points
 
@@ -50,7 +49,7 @@ def write_numbers(axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]]
     for i, (_, text) in enumerate(marks):
         place: Array = at[i]
         half = np.array([WIDE * len(text), TALL]) * size / 2
-        middles = [place + np.array(away) * (half + APART - 1) for away in AWAY]
+        middles = [place + np.array(away) * (half + APART) for away in AWAY]
         free = [m for m in middles if _inside(m, half, reach) and not any(_meet(m, half, *other) for other in taken)]
         if not free:
             continue
@@ -79,18 +78,18 @@ def shell_caption(h: float, nu: float, row: Row) -> str:
     return text + (f", {named_value('lambda_m', row)}" if row["lambda_m"] else "")
 
 
-def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
+def caption(h: float, nu: float, row: Row, driven: Iterable[str] = ()) -> str:
     """The shell and its loads at a point.
 
     Parameters
     ----------
-    own
-        Names of user-defined amplitudes, columns of the row.
+    driven
+        Amplitudes that have been driven up to there.
 
     Examples
     --------
     >>> row = {"lambda_m": 0.0, "field_angle": 0.0, "p_over_pc": 0.25, "amplitude": "pressure"}
-    >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, own=["my_springs"])
+    >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, driven=["pressure", "my_springs"])
     '$R/h$ = 100, $\\\\nu$ = 0.5, $p/p_\\\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
     parts = [shell_caption(h, nu, row)]
@@ -104,7 +103,8 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
         parts.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
     if row["amplitude"] == "time":
         parts.append(named_value("time", row))
-    parts += [named_value(name, row) for name in own if row[name]]
+    others = (amplitude(name).column for name in driven)
+    parts += [named_value(column, row) for column in others if column not in NAMED and row.get(column)]
     return ", ".join(parts)
 
 

@@ -229,7 +229,8 @@ def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> st
     chosen = in_true_time(rows) if amplitude == "time" else evenly(part, MOST_FRAMES)
     surfaces, abouts = zip(*(run.at(row) for row in chosen), strict=True)
     about: About = abouts[0]
-    titles = [caption(about.h, about.nu, row) for row in chosen]
+    driven = list(dict.fromkeys(str(row["amplitude"]) for row in rows if row["amplitude"]))
+    titles = [caption(about.h, about.nu, row, driven) for row in chosen]
     content = animated(surfaces, about.h, titles, rows, chosen, run.camera, run.place)
     write_whole(folder / "animation.gif", content)
     return "animation.gif"

@@ -226,7 +226,7 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file of `begin_checkpoint` or of an earlier run; an incomplete last entry is cut off.
+        The file of a run that begins (`begun`), or of an earlier run; an incomplete last entry is cut off.
     V
         The displacement's space.
     comm

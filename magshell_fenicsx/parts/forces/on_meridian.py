@@ -13,8 +13,9 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, PointForce
 from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
+from magshell_fenicsx.parts.loads import forces
 
 Integral = Callable[[Expr], ufl.Form]
 
@@ -48,9 +49,7 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog)
     Vectors are along e3, and points are on the axis.
     """
     parts, size = list[tuple[Expr, Integral]](), 0.0
-    for load in loads:
-        if isinstance(load, EdgeMoment | Potential):
-            continue
+    for load in forces(loads):
         if isinstance(load, PointForce):
             over = on.pole()
         elif isinstance(load, EdgeForce):

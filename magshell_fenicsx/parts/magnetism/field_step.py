@@ -1,7 +1,6 @@
 """The applied field as a load: its strength and its direction."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from math import acos, degrees
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -10,10 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction, in_units
-from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target, Until
+from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target
 from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves
 
@@ -25,7 +24,7 @@ Array = NDArray[np.float64]
 SAME = 1e-9  # cosine of directions: rounding
 
 
-class FieldSection(PathStep):
+class FieldSection(FactorStep):
     """The field itself is the load: lambda_m from zero, with its instabilities located.
 
     `until: target` ends at the field of `magnetic` or its `factor`, the others go on in its direction. By default the
@@ -33,17 +32,14 @@ class FieldSection(PathStep):
     """
 
     amplitude: ClassVar[str] = "lambda_m"
+    section: ClassVar[str] = "magnetic"
+    label: ClassVar[Literal["", "field"]] = "field"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "lambda_m")}
     kind: Literal["field"]
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: λ_m, or arc length, which passes its folds"""
-    until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target over the field of `magnetic`; 1 by default, 0 switches the field off"""
-
-    @property
-    def _end(self) -> float | None:
-        return 1.0
 
     def scale(self, now: Now) -> float:
         return now.size
@@ -57,11 +53,6 @@ class FieldSection(PathStep):
         if magnetic is None or not magnetic.applied.flux_density:
             raise ValueError("needs magnetic.applied.flux_density")
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
-
-    def course(self, here: Here) -> Course:
-        until = "target" if self.until == "zero" else self.until
-        steps = self.points if until == "points" else None
-        return Course(self.drive(self._now(here)), until, steps, self.curves(here))
 
     def curves(self, here: Here) -> tuple[Curves, float] | None:
         from magshell_fenicsx.parts.magnetism.direction import straight  # the solver takes long to import
@@ -77,36 +68,23 @@ class FieldSection(PathStep):
         direction = components(directions(here.context.steps, field, here.turn)[here.step.number - 1], field)
         return direction, float(direction @ field_at(here.mu))
 
-    def _now(self, here: Here) -> Now:
+    def now(self, here: Here) -> Now:
         """The field has no conjugate."""
         return Now(self._along(here)[1], 0.0, 0.0, here.driven, self.size(here.context), here.h)
 
     @classmethod
-    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
-        return [] if driven or not strength(context) else [("magnetic", FieldBefore(kind="field"))]
+    def asked_for(cls, context: Context) -> bool:
+        return bool(strength(context))
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not strength(context):
             raise ValueError(f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
 
-
-class FieldBefore(FieldSection):
-    """The field that is applied before the one load of a case; it ends at the first instability."""
-
-    def drive(self, now: Now) -> Drive:
-        return Drive("arc", "load", now.size, [now.size], now.size / 2, now.size)
-
-    def course(self, here: Here) -> Course:
-        course = super().course(here)
-
-        def forbidden(mu: Mapping[str, float], what: str) -> str:
-            return (
-                f"the field alone makes the shell unstable: critical field lambda_m = {mu[self.amplitude]:.9g} of "
-                f"{course.drive.end or 0.0:g} ({what})"
-            )
-
-        return replace(course, until="limit", forbidden=forbidden, label="field")
+    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+        return (
+            f"the field alone makes the shell unstable: critical field lambda_m = {value:.9g} of "
+            f"{course.drive.end or 0.0:g} ({what})"
+        )
 
 
 class RotationSection(Step):

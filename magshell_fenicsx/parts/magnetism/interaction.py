@@ -1,18 +1,18 @@
 """The interaction of magnetised parts as a load: from none to all of it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.course import Course, Drive, Here, Now, Target, Until
+from magshell_fenicsx.parts.course import Course, Target
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.seen import Seen
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.sections import MeshSurface
 
@@ -38,7 +38,7 @@ class Interaction:
     itself: bool = False
 
 
-class InteractionStep(PathStep):
+class InteractionStep(FactorStep):
     """What is magnetised begins to act on the other parts of the shell: the factor of their energy grows from 0 to 1.
 
     The square root of the factor multiplies the remanence in the interaction alone. By default the path is followed by
@@ -46,6 +46,7 @@ class InteractionStep(PathStep):
     """
 
     amplitude: ClassVar[str] = AMPLITUDE
+    section: ClassVar[str] = "magnetic"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(AMPLITUDE, "interaction", "Factor of the energy of magnetised parts in each other's field.", "load"),
@@ -53,40 +54,22 @@ class InteractionStep(PathStep):
     kind: Literal["interaction"]
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: the factor, or arc length, which passes its folds"""
-    until: Until = "target"
     factor: float | None = Field(default=None, ge=0, le=1e3)
     """Target of the factor; 1 by default, 0 switches the interaction off"""
 
-    @property
-    def _end(self) -> float | None:
-        return 1.0
-
     @classmethod
-    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        driven = loading is not None and loading.amplitude == cls.amplitude
-        return [] if driven or not acts(context) else [("magnetic", InteractionBefore(kind="interaction"))]
+    def asked_for(cls, context: Context) -> bool:
+        return acts(context)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not acts(context):
             raise ValueError(f"{step.key}.kind: interaction needs magnetic.interaction: others or all")
 
-
-class InteractionBefore(InteractionStep):
-    """The interaction before the one load of a case; it ends at the first instability."""
-
-    def drive(self, now: Now) -> Drive:
-        return Drive("arc", "load", 1.0, [1.0], 0.5, 1.0)
-
-    def course(self, here: Here) -> Course:
-        course = super().course(here)
-
-        def forbidden(mu: Mapping[str, float], what: str) -> str:
-            return (
-                f"the interaction alone makes the shell unstable at {mu[self.amplitude]:.9g} of it ({what}): to go on, "
-                "take it as a load, kind: interaction"
-            )
-
-        return replace(course, until="limit", forbidden=forbidden)
+    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+        return (
+            f"the interaction alone makes the shell unstable at {value:.9g} of it ({what}): to go on, take it as a "
+            "load, kind: interaction"
+        )
 
 
 def acts(context: Context) -> bool:

@@ -97,7 +97,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
         if context.of(MagneticSection) is None:
             raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
         context.needs("sensors", "the whole shell", "a mid-surface")
-        if context.shell.rubber is not None:  # its thickness follows from its area
+        if "a thickness that does not change" in context.withdrawn:  # it follows from the area
             context.needs("sensors", "the area as drawn")
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:

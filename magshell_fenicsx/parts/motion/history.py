@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, number_and_unit, with_unit
-from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.parts.part import Ability, Context, Offer
 
 Value = Callable[[Any], float]  # a time or a level as a plain number
 Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
@@ -184,6 +184,10 @@ class Viscosity(Ability):
     def of(cls, context: Context) -> "Viscosity | None":
         shell = context.shell
         return cls(shell.viscosity, shell.relaxation) if shell.viscosity is not None or shell.relaxation else None
+
+    def withdraws(self, context: Context) -> dict[Offer, str]:
+        """Stress depends on the history of strain."""
+        return {"a material without viscosity": "leave out shell.viscosity and shell.relaxation"}
 
     def refuse_unfit(self, context: Context) -> None:
         """See that its numbers are positive and that their units have a meaning."""

@@ -88,7 +88,7 @@ class TimeSection(Step):
     """What ends the step with `until: event`"""
 
     @model_validator(mode="after")
-    def _loads_are_held(self) -> Self:
+    def _keys_fit(self) -> Self:
         for name, how in self.hold.items():
             if how != "load" and name in self.drives:
                 raise ValueError(f"hold.{name}: it follows its history: only load is allowed")
@@ -104,9 +104,8 @@ class TimeSection(Step):
             times = [float(in_units("second")(t)) for t in times_of(history)]
             if isinstance(history, list) and (times[0] < 0 or times != sorted(times)):
                 raise ValueError(f"history.{name}: the times of a table must not fall, nor be negative")
-            if not isinstance(history, list) and min(times, default=1.0) < (
-                0 if history_may_begin(history) else 1e-300
-            ):
+            jumps, least = getattr(history, "kind", "") == "step", min(times, default=1.0)
+            if not isinstance(history, list) and (least < 0 or (least == 0 and not jumps)):
                 raise ValueError(f"history.{name}: times must be positive")
         return self
 
@@ -185,8 +184,3 @@ def level_in(context: Context, name: str, level: Level) -> float:
         return level
     own = next((type(step.load) for step in context.steps if step.name == name), None)
     return (own or STEPS[name]).level(level, context)
-
-
-def history_may_begin(history: History) -> bool:
-    """Whether a time of it may be zero: that of a jump."""
-    return getattr(history, "kind", "") == "step"

@@ -106,7 +106,7 @@ def observed_reactions(
     Parameters
     ----------
     frame
-        The model's frame, see `mesh.frame.rotation`.
+        The model's frame, see `mesh.mirror.rotation`.
     force, length
         E h R and R in the case's units.
     """

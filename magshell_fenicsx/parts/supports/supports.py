@@ -82,8 +82,8 @@ def refuse_unknown(
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {there}")
     for term in loads.own:
         if term.on is not None and term.on not in edges:
-            there = ", ".join(sorted(edges)) or "none"
-            raise MeshError(f"terms: {term.name}: on: {term.on}: the surface has no such edge, only {there}")
+            there, key = ", ".join(sorted(edges)) or "none", term.key or f"terms: {term.name}: on"
+            raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {there}")
 
 
 def no_mirror(name: str) -> str:

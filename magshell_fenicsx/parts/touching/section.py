@@ -157,15 +157,16 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
             "it between edges with boundary: symmetry"
         )
     for step in context.steps:
-        _refuse_step(step)
+        _refuse_step(step, context)
     if context.sections.get("gradients"):
         raise ValueError("gradients: of shells that may touch each other are not built: leave out contact or gradients")
 
 
-def _refuse_step(step: "ProgrammeStep") -> None:
-    for kind, why in (("time", "steps in time do not know it"), ("imperfection", "the undeformed gaps would change")):
-        if step.kind == kind:
-            raise ValueError(f"{step.key}.kind: {kind}: with contact, {why}: take steps along a path")
+def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
+    grows = bool(step.load.multiplies(step, context))
+    for refused, why in ((step.load.in_time, "steps in time do not know it"), (grows, "undeformed gaps would change")):
+        if refused:
+            raise ValueError(f"{step.key}.kind: {step.kind}: with contact, {why}: take steps along a path")
     if getattr(step.load, "search", None):
         raise ValueError(f"{step.key}.search: with contact between shells it is not built: leave it out")
     if getattr(step.load, "then", None) or getattr(step.load, "sensitivities", False):

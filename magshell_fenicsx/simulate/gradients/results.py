@@ -10,7 +10,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.shell.parameters import EdgeMoment, Potential
+from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.sections import MeshSurface
@@ -159,11 +159,7 @@ class Expected(Scene):
 
     def __init__(self, problem: Problem) -> None:
         loads = problem.loads
-        size = {
-            name: 1.0
-            for name, several in loads.dead.items()
-            if not all(isinstance(load, EdgeMoment | Potential) for load in several)
-        }
+        size = {name: 1.0 for name, several in loads.dead.items() if forces(several)}
         highest = ["pole"] if isinstance(problem.context.shell, MeshSurface) else []
         model = SimpleNamespace(
             loads=loads,

@@ -246,7 +246,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
 
 @pytest.mark.parametrize(
     ("name", "built"),
-    [("winkler", "meridian"), ("weight along e1", "half shell"), ("weight along e2", "full shell")],
+    [("winkler", "meridian"), ("weight along e1", "half shell"), ("weight along e2", "half shell")],
 )
 def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     of, parameters, *_ = DENSITIES[name]
@@ -256,12 +256,16 @@ def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     assert problem.included[-1] == "own energy: own"
 
 
-def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
-    """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
+def test_half_model_of_another_plane() -> None:
+    """The half shell's frame is turned to its mirror plane, and a direction in this plane with it."""
     settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     assert make_problem(case, [OwnTerm("own", winkler)]).half
     assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
+    within = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.5])
+    problem = make_problem(case, [OwnTerm("own", weight, (within,))])
+    assert problem.half
+    assert problem.azimuth == pytest.approx(np.radians(20))
 
 
 @pytest.mark.parametrize(
@@ -277,7 +281,7 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
 def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     with pytest.raises(CaseError, match=said):
-        make_problem(case, [OwnTerm(name, weight, (E2,)) for name in names])
+        make_problem(case, [OwnTerm(name, weight, (E1 + E2,)) for name in names])
 
 
 def test_a_solid_has_no_curvature() -> None:
@@ -301,3 +305,24 @@ def test_parameters_need_no_new_kernel() -> None:
     assert one == other
     u = random_displacement(models[0], 1e-2)
     assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))
+
+
+@pytest.mark.parametrize(("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")])
+def test_a_term_that_only_observes(model: str, symmetry: str) -> None:
+    """The mean displacement of the hanging strip is ρ g L²/(3 E), its area before that L²/10; no amplitude is added."""
+    sections = {
+        "model": model,
+        "shell": {"geometry": "strip", "width": 0.1, "radius_to_thickness": 50.0, "poisson_ratio": 0.0},
+        "boundary": {"root": "clamped"},
+        "loading": {"kind": "gravity", "direction": [1, 0, 0], "acceleration": 1e-3, "points": 1},
+        "symmetry": symmetry,
+    }
+    seen = {"mean_ux": lambda r0, u: 10 * u.r[0], "area": lambda r0, u: ufl.as_ufl(1.0)}
+    case = Case.from_source(Source("test", sections))
+    scene = Scene(case, terms=[OwnTerm("mean", None, observed=seen, of_volume=model == "solid")])
+    *_, record = follow(scene)
+    row = scene.observe(record.point.state)
+    assert row["mean_ux"] == pytest.approx(1e-3 / 3, rel=2e-3)
+    assert row["area"] == pytest.approx(0.1)
+    assert "mean" not in scene.extra_columns
+    assert "mean" not in record.point.state.mu

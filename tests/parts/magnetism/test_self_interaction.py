@@ -11,6 +11,7 @@ from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
 from test_own_field import sphere_of_triangles
 
 from magshell_fenicsx import Scene
+from magshell_fenicsx.assembly.whole import WholeMatrix
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.parts.magnetism.coulomb import Charged
@@ -88,7 +89,8 @@ def test_derivatives(model: Any, tmp_path: Path) -> None:
     energies = [(w, system.at(State(each, mu)).of(term.energy)) for w, each in moved]
     assert sum(w * value for w, value in energies) == pytest.approx(slope @ v, rel=1e-6)
     assert np.abs(slope.reshape(-1, 3).sum(axis=0)).max() < 1e-12 * np.abs(slope).sum()
-    rows = system.at(State(u, mu)).of(lambda: system._whole.rows([(1.0, term)])).reshape(system.size, -1)
+    matrix = WholeMatrix(system.u.function_space, system.clamped)
+    rows = system.at(State(u, mu)).of(lambda: matrix.rows([(1.0, term)])).reshape(system.size, -1)
     change = sum(w * gradient(scene, each) for w, each in moved)
     assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
     assert np.abs(rows - rows.T).max() < 1e-11 * np.abs(rows).max()

@@ -1,0 +1,93 @@
+"""The shell's own weight: its density times an acceleration along one direction."""
+
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.input.section import Finite, over
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.course import Now, Target, Until
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
+
+ACCELERATION = Unit(
+    "E/(ρ R)",
+    "m/s²",
+    "m_per_s2",
+    "m/s²",
+    lambda g: g.E / (g.rho * g.R),
+    text="metre/second**2",
+    needs=DENSITY_TOO,
+    symbol="g",
+)
+
+
+class GravityStep(PathStep):
+    """The shell's own weight, or that of a steady acceleration: the forces ρ g per volume along a direction.
+
+    The weight follows the thickness where this varies, and acts in all of a solid. Steps in different directions have
+    weights of their own, which add up: gravity, gravity_2.
+    """
+
+    amplitude: ClassVar[str] = "gravity"
+    targets: ClassVar[dict[str, Target]] = {"acceleration": Target("load", "gravity")}
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("gravity", "gravity", "Weight ρ g R/E of the shell; in SI g.", "load", "ρ g R/E", (ACCELERATION,)),
+    )
+    kind: Literal["gravity"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: g, or arc length, which passes its folds"""
+    until: Until = "target"
+    direction: list[Finite] = Field(default=[0.0, 0.0, -1.0], min_length=3, max_length=3)
+    """Its three components, of any length; by default down e3"""
+    acceleration: Annotated[float, over(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
+
+    @field_validator("direction")
+    @classmethod
+    def _points_somewhere(cls, direction: list[float]) -> list[float]:
+        if not any(direction):
+            raise ValueError("must not be zero")
+        return direction
+
+    @property
+    def place(self) -> Any:
+        return tuple(self.direction)
+
+    @property
+    def _along(self) -> NDArray[np.float64]:
+        """The unit vector (3,); the square of 1e-200 would be zero."""
+        large = np.array(self.direction) / max(map(abs, self.direction))
+        return np.asarray(large / np.linalg.norm(large))
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        return change / self.points if self.target else now.h**2
+
+    def scale(self, now: Now) -> float:
+        return abs(self.acceleration or now.h**2)
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        return [Leaves(vectors=[self._along])]
+
+    def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
+        return [OwnTerm(step.name, energy, (self._along,), of_volume=True)]
+
+    def account(self, step: ProgrammeStep, context: Context) -> str:
+        along = ", ".join(f"{c + 0.0:.3g}" for c in self._along)
+        return f"the shell's weight along [{along}], amplitude {step.name} = ρ g R/E"
+
+
+def energy(r0: Jet, u: Jet, along: Expr) -> Expr:
+    """The energy density for ρ g R/E = 1, zero where nothing has moved."""
+    return -ufl.dot(u.r, along)
