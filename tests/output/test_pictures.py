@@ -100,6 +100,16 @@ def test_light_comes_from_the_upper_left() -> None:
         assert (image[150, 300 - right, :3] == 255).all()
 
 
+def test_a_plate_has_the_colours_of_its_bar() -> None:
+    """One that is turned away from the lamp too: there was a quarter of its light missing."""
+    only = slopes(0.5)
+    right = Surface(only.r0[4:], 0 * only.r0[4:], only.n0[4:], only.cells[:2], {})
+    image = seen(right).coloured(np.zeros(4), (-1.0, 1.0), colour_map(SIGNED))
+    inside = image[..., 3] == 255
+    assert inside.any()
+    assert image[inside][:, :3].min() >= 253  # but for what is lost where it is seen aslant
+
+
 def test_what_is_in_front_hides_what_is_behind() -> None:
     """Two squares, one above the other, and linear values between nodes, as an independent formula has them."""
     low, high = plate(0.0), plate(-0.5)  # -w is up
