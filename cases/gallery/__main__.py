@@ -77,9 +77,9 @@ def thumbnails(names: Sequence[str]) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode.
+    """The pictures that show the result best: of a motion or a snap through two folds the curve, of a bifurcation its mode.
 
-    Where the branch that begins there is followed, that is the shell.
+    Where the branch that begins there is followed, that is the shell. Beside bodies and magnets these are shown.
     """
     if not (folder / "path.csv").exists():
         return []
@@ -88,7 +88,10 @@ def telling(folder: Path) -> list[str]:
         return ["curve.png"]
     if any(row["label"] == "bifurcation" and row["mode"].startswith("m = ") for row in rows[:-1]):
         return ["shell.png"]
-    return ["instabilities.png"] if any(row["label"] == "bifurcation" for row in rows) else []
+    if any(row["label"] == "bifurcation" for row in rows):
+        return ["instabilities.png"]
+    beside = {"approach_over_h", "source"} & rows[0].keys()
+    return ["curve.png"] if sum(row["label"] == "fold" for row in rows) > 1 and not beside else []
 
 
 def _shrink(source: Path, target: Path) -> None:
