@@ -145,6 +145,7 @@ def test_animation(run: Path, tmp_path: Path) -> None:
             moving.seek(i)
             frames.append(np.asarray(moving.convert("RGB"), dtype=int))
     assert len(content) < 3e6
+    assert all((frame[:5] == 255).all() for frame in frames)  # white paper, not a colour near it
     assert len(rows) <= len(frames) <= len(rows) + 1
     changes = np.array([np.abs(frame - frames[0]).max(axis=2) for frame in frames])
     foot = changes[:, -20:]

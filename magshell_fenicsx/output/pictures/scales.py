@@ -86,7 +86,8 @@ def colour_bar(
 
     extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
     reach = axes.get_position().width * figure.get_figwidth() * 72 / rcParams["font.size"]  # letters
-    few, close = (3, max(CLOSE, LETTERS / reach)) if reach < 16 else (5, CLOSE)
+    short = orientation == "horizontal" and reach < 16
+    few, close = (3, max(CLOSE, LETTERS / reach)) if short else (5, CLOSE)
     low, high = of.limits
     between = MaxNLocator(few, steps=[1, 2, 5, 10]).tick_values(low, high)
     inner = [v for v in between if close < (v - low) / (high - low) < 1 - close]
