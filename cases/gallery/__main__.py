@@ -60,6 +60,7 @@ def row(file: Path) -> str:
     lines = [line.strip() for line in said.stdout.splitlines() if line.strip() and not line.startswith("results in")]
     last = lines[-1] if lines else said.stderr.strip()
     end = f" Ends with exit code {said.returncode}." if said.returncode else ""
+    _add_shapes(folder)
     shots = [folder / name for name in (*telling(folder), *FIRST) if (folder / name).exists()]
     if not shots:
         raise SystemExit(f"{file.name}: no picture: {said.stderr.strip() or last}")
@@ -77,9 +78,9 @@ def thumbnails(names: Sequence[str]) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of a motion the curve over the time, of a bifurcation its mode.
+    """The pictures that show the result best: of motions and snaps the curve, of a bifurcation its mode.
 
-    Where the branch that begins there is followed, that is the shell.
+    Where the branch that begins there is followed, that is the shell. Beside bodies and magnets these are shown.
     """
     if not (folder / "path.csv").exists():
         return []
@@ -88,7 +89,18 @@ def telling(folder: Path) -> list[str]:
         return ["curve.png"]
     if any(row["label"] == "bifurcation" and row["mode"].startswith("m = ") for row in rows[:-1]):
         return ["shell.png"]
-    return ["instabilities.png"] if any(row["label"] == "bifurcation" for row in rows) else []
+    if any(row["label"] == "bifurcation" for row in rows):
+        return ["instabilities.png"]
+    beside = {"approach_over_h", "source"} & rows[0].keys()
+    return ["curve.png"] if sum(row["label"] == "fold" for row in rows) > 1 and not beside else []
+
+
+def _add_shapes(folder: Path) -> None:
+    """On the curve of a snap: the shell as it is, at its first fold and at the end."""
+    if telling(folder) == ["curve.png"] and (rows := read_rows(folder / "path.csv"))[-1]["amplitude"] != "time":
+        fold = next(row for row in rows if row["label"] == "fold")
+        points = ",".join(str(row["point"]) for row in (rows[0], fold, rows[-1]))
+        subprocess.run(["magshell", "plot", str(folder), "--shapes", points], capture_output=True, check=True)
 
 
 def _shrink(source: Path, target: Path) -> None:

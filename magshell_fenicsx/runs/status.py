@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -170,7 +171,7 @@ class RunProgress:
         if left is not None:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
         of = f" in step {self._step} of {len(self._aims)}" if self._scene.problem.listed else ""
-        ahead = self._aim.text(self._row) if self._aim else ""
+        ahead = "the snap" if self._snaps else self._aim.text(self._row) if self._aim else ""
         self._report("  ".join(part for part in (f"{self._count}{of}", ahead, times, f"du/h {step:.2g}") if part))
 
     def doing(self, what: str) -> None:
@@ -185,8 +186,18 @@ class RunProgress:
         return self._aims[self._step - 1] if self._aims else None
 
     @property
+    def _load(self) -> Any:
+        """What the present step drives; None without steps."""
+        steps = self._scene.problem.programme
+        return steps[self._step - 1].load if steps else None
+
+    @property
     def _branched(self) -> bool:
         """Whether the case requests branches; their number is not known in advance."""
-        steps = self._scene.problem.programme
-        load = steps[self._step - 1].load if steps else None
-        return load is not None and load.branch_points > 0
+        return self._load is not None and self._load.branch_points > 0
+
+    @property
+    def _snaps(self) -> bool:
+        """Whether the step has come to its fold and the shell is released there."""
+        released = self._row.get("label") == "fold" or self._row.get("amplitude") == "time"
+        return released and getattr(self._load, "then", None) == "snap"

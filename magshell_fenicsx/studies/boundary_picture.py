@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.output.pictures.lines import smooth
-from magshell_fenicsx.output.pictures.scales import numbers
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.naming import key_label
 
@@ -75,7 +74,8 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     for value in sorted({row["second"] for row in rows}, reverse=True):
         line = [row for row in rows if row["second"] == value]
         if line[0] not in others:
-            _line(plot, line, color=plt.cm.viridis(0.9 * shade(value)), marked=True, label=numbers([value])[0][0])
+            text = f"{value:g}".replace("-", "−")
+            _line(plot, line, color=plt.cm.viridis(0.9 * shade(value)), marked=True, label=text)
     _marks(plot, "load", [row for row in rows if row not in others])
     plot.set(xlabel=names[0], ylabel=quantity(amplitude(content["load"]).column).label, title=_title(content))
     plot.legend(**LEGEND, title=names[1], title_fontsize=8)

@@ -24,7 +24,7 @@ from magshell_fenicsx.output.pictures.colours import loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png, written
 from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, figures, spread
-from magshell_fenicsx.output.pictures.scales import SIGNED, colour_map
+from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
 from magshell_fenicsx.output.pictures.view import (
     LAMP,
     RELIEF,
@@ -98,6 +98,16 @@ def test_light_comes_from_the_upper_left() -> None:
     for image, right in ((shown[0.5], 225), (shown[-0.5], 75)):
         assert image[150, right, :3] == pytest.approx(np.full(3, dark), abs=1.5)
         assert (image[150, 300 - right, :3] == 255).all()
+
+
+def test_a_plate_has_the_colours_of_its_bar() -> None:
+    """One that is turned away from the lamp too: there was a quarter of its light missing."""
+    only = slopes(0.5)
+    right = Surface(only.r0[4:], 0 * only.r0[4:], only.n0[4:], only.cells[:2], {})
+    image = seen(right).coloured(np.zeros(4), (-1.0, 1.0), colour_map(SIGNED))
+    inside = image[..., 3] == 255
+    assert inside.any()
+    assert image[inside][:, :3].min() >= 253  # but for what is lost where it is seen aslant
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
@@ -252,6 +262,23 @@ def test_strains_of_the_mesh_are_no_picture() -> None:
     assert "those of bending are 5000 times larger" in said
     surface.fields["E_1"] = 1e-3 * wave
     assert len(strains(replace(surface, strain_jump=0.14), 0.01)[0]) == 1
+
+
+def test_what_the_mesh_leaves_is_no_second_moment() -> None:
+    """Three per cent at one corner, where moments differ by ten per cent between cells, are named; more are drawn."""
+    for second, drawn in ((0.03, 1), (0.5, 2)):
+        fields = {"M_1": np.ones(4), "M_2": np.array([second, 0.0, 0.0, 0.0])}
+        shown, said = moments(replace(plate(0.0), fields=fields, jump=0.1), 0.01)
+        assert len(shown) == drawn
+        assert ("The smaller principal moment is zero but for the mesh." in said) == (drawn == 1)
+
+
+def test_numbers_of_a_short_bar_do_not_touch() -> None:
+    """Beside -16.7 and 16.7 there is room for a zero, not for ten."""
+    figure = Figure(figsize=(2.2, 2.0))
+    box = figure.add_axes((0.2, 0.5, 0.5, 0.1))
+    colour_bar(figure, box, Scale((-16.7, 16.7), SIGNED, "true stress"))
+    assert [label.get_text() for label in box.get_xticklabels()] == ["−16.7", "0", "16.7"]
 
 
 def test_arrows_are_apart() -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from PIL import Image
 
 import magshell_fenicsx as ms
@@ -16,7 +18,7 @@ from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.pictures.plot import Drawn, draw, draw_animation, in_true_time, plot, plot_runs
-from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
+from magshell_fenicsx.output.pictures.several import _free, add_shapes, runs_figure
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.problem.wanted import OutputSection
 
@@ -144,6 +146,7 @@ def test_animation(run: Path, tmp_path: Path) -> None:
             moving.seek(i)
             frames.append(np.asarray(moving.convert("RGB"), dtype=int))
     assert len(content) < 3e6
+    assert all((frame[:5] == 255).all() for frame in frames)  # white paper, not a colour near it
     assert len(rows) <= len(frames) <= len(rows) + 1
     changes = np.array([np.abs(frame - frames[0]).max(axis=2) for frame in frames])
     foot = changes[:, -20:]
@@ -200,3 +203,25 @@ def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
     assert "curve.png" in draw(again, shapes=[2, last])
     with pytest.raises(CaseError, match=f"--shapes 999: .* has points 0 to {last}"):
         draw(again, shapes=[999])
+
+
+@pytest.mark.parametrize("size", [(0.26, 0.1), (0.1, 0.34)])
+def test_a_shell_beside_a_curve_covers_nothing(size: tuple[float, float]) -> None:
+    """Wide or tall, five of them at points of a wave: within the axes, beside the curve and beside each other."""
+    figure = Figure()
+    axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+    x = np.linspace(0, 1, 400)
+    y = np.sin(2 * np.pi * x)
+    axes.plot(x, y)
+    figure.draw_without_rendering()
+    curve = axes.transAxes.inverted().transform(axes.transData.transform(np.column_stack([x, y])))
+    boxes = list[NDArray[np.float64]]()
+    for i in (0, 100, 200, 300, 399):
+        low = _free(axes, np.array([x[i], y[i]]), np.array(size), boxes)
+        boxes.append(np.array([low, low + size]))
+    for i, (low, high) in enumerate(boxes):
+        assert (low >= 0).all()
+        assert (high <= 1).all()
+        assert not ((curve > low) & (curve < high)).all(axis=1).any()
+        for one, two in boxes[:i]:
+            assert (np.minimum(high, two) <= np.maximum(low, one)).any()

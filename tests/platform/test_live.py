@@ -192,6 +192,26 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the fold on, where it may be rehearsed for minutes, it is called what it is."""
+    case = Case.load(CASES / "dimple_buckling.yaml", ["loading.then=snap", "magnetic=null"])
+    told: list[str] = []
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.0)
+    model = SimpleNamespace(contacts={})
+    problem = replace(make_problem(case), material=Material(0.5, 0.01))
+    scene = SimpleNamespace(case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes())
+    progress = RunProgress(scene, told.append, 0.0)  # type: ignore[arg-type]
+    here = SimpleNamespace(du=np.array([0.0, -0.5]))
+    progress.beginning(1)
+    for label in ("step", "fold"):
+        progress.accepted({"label": label, "amplitude": "pressure", "p_over_pc": 0.3}, known=False)
+        progress.trying(here, 0.02)  # type: ignore[arg-type]
+    assert told == [
+        "1 point  p/pc 0.3 -> the first instability  0:00  du/h 1",
+        "2 points  the snap  0:00  du/h 1",
+    ]
+
+
 def test_where_a_path_leads() -> None:
     """To a value, through a number of steps, or nobody knows how far."""
     row = {"p_over_pc": 0.25, "w_over_h": 5.0}

@@ -54,6 +54,16 @@ def test_clamped_plate_by_half_and_whole() -> None:
     assert Counter(label for label, _ in half[:6]) == {"": 4, "antisymmetric": 2}
 
 
+def test_a_dent_between_small_elements_has_no_waves() -> None:
+    """Nodes of a ring count by their distance: most of them are in a dent, which a wave of few crests fits there."""
+    theta = np.concatenate([np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)])
+    r0 = np.column_stack([np.cos(theta), np.sin(theta), 1e-3 * theta])
+    r0 = np.concatenate([r0, [[0.0, 0.0, 1.0]]])  # it is not flat
+    for w, waves in ((np.exp(-((theta / 0.5) ** 2)), None), (np.cos(3 * theta), 3)):
+        fields = {"mode_w": np.append(w, 0.0)}
+        assert wave_number(Surface(r0, 0 * r0, r0, np.zeros((0, 3), int), fields)) == waves
+
+
 @cache
 def past_the_fold(symmetry: str, degree: int, refinement: float = 1.0) -> tuple[Scene, dict[str, Record]]:
     """cases/dimple_buckling.yaml: a point before its fold, the fold, and one past it."""

@@ -12,7 +12,6 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.pictures.scales import numbers
 from magshell_fenicsx.studies.boundary_picture import draw_map
 
 ARCH = CASES / "arch_boundary.yaml"
@@ -191,7 +190,7 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
     both, one = drawn
     assert [axes.get_xlabel() for axes in both.axes] == 2 * ["amplitude over $h$"]
     assert both.axes[1].get_ylabel() == r"field  $\lambda_\mathrm{m}$"
-    assert [text.get_text() for text in both.axes[0].get_legend().get_texts()] == [numbers([-0.002])[0][0]]
+    assert [text.get_text() for text in both.axes[0].get_legend().get_texts()] == ["−0.002"]
     said = [text.get_text() for text in both.axes[1].get_legend().get_texts()]
     assert said == ["by the pressure", "by the field", "nowhere"]
     assert len(one.axes) == 1

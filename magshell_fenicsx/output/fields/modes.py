@@ -177,15 +177,18 @@ def wave_number(surface: Surface) -> int | None:
         return None
     ring = np.abs(height - height[np.argmax(np.abs(w))]) < RING
     theta = np.arctan2(surface.r0[ring, 1], surface.r0[ring, 0])
-    turn = np.sort(theta)
-    if np.diff(turn, append=turn[0] + 2 * np.pi).max() > GAP:
+    order = np.argsort(theta)
+    theta, w = theta[order], w[ring][order]
+    ahead = np.diff(theta, append=theta[0] + 2 * np.pi)
+    if ahead.max() > GAP:
         return None
+    share = np.sqrt((ahead + np.roll(ahead, 1)) / 2)  # of the ring: where elements are small there are many nodes
     left = []
     for m in range(MOST_WAVES + 1):
-        basis = np.column_stack([np.cos(m * theta), np.sin(m * theta)])
-        left.append(float(np.sum((w[ring] - basis @ np.linalg.lstsq(basis, w[ring])[0]) ** 2)))
+        basis = share[:, None] * np.column_stack([np.cos(m * theta), np.sin(m * theta)])
+        left.append(float(np.sum((share * w - basis @ np.linalg.lstsq(basis, share * w)[0]) ** 2)))
     best = int(np.argmin(left))
-    return best if best >= 2 and left[best] < 0.1 * float(np.sum(w[ring] ** 2)) else None
+    return best if best >= 2 and left[best] < 0.1 * float(np.sum((share * w) ** 2)) else None
 
 
 PREFIX = "gradients_"

@@ -83,12 +83,25 @@ def animated(
         frames = _composed(views, factor, titles, rows, shown, pole)
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
     palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
-    first, *others = (Pillow.fromarray(frame).quantize(palette=palette, dither=dither) for frame in frames)
+    first, *others = (
+        _in_palette(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither)) for frame in frames
+    )
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
     content = io.BytesIO()
     first.save(content, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
     return content.getvalue()
+
+
+def _in_palette(frame: Image, found: "Pillow.Image") -> "Pillow.Image":
+    """The colours that were found, and white where a frame is white: Pillow takes a neighbour of white too."""
+    from PIL import Image as Pillow
+
+    numbers = np.asarray(found).copy()
+    numbers[(frame == WHITE[0]).all(axis=-1)] = 0
+    white = Pillow.fromarray(numbers, "P")
+    white.putpalette(found.getpalette() or [])
+    return white
 
 
 def _palette(frames: Sequence[Image]) -> "Pillow.Image":

@@ -118,8 +118,7 @@ def stretches(surface: Surface) -> list[Coloured]:
     for name, said in STRETCHES.items():
         if (values := surface.fields.get(name)) is not None:
             low, high, signed = float(values.min()), float(values.max()), name.startswith("sigma")
-            most = max(-low, high, ROUNDING["E_1"])
-            limits = (-most, most) if signed else (low, max(high, low + 1e-9))
+            limits = from_zero(low, max(high, ROUNDING["E_1"])) if signed else (low, max(high, low + 1e-9))
             found.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
     return found
 
@@ -140,7 +139,7 @@ def _largest(surface: Surface, names: Iterable[str]) -> float:
 def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -> tuple[list[Coloured], list[str]]:
     """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible.
 
-    One that is zero beside the other is named, not drawn.
+    One that is zero beside the other, or no larger than what the mesh leaves of both, is named, not drawn.
     """
     if not captions.keys() <= surface.fields.keys():
         return [], []
@@ -152,6 +151,9 @@ def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -
         values = surface.fields[name]
         if sizes[name] < NONE * max(sizes.values()):
             said.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
+            continue
+        if float(np.sqrt((values**2).mean())) < _noise(surface, first, second, jump or 0.0) / NOISE:
+            said.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
             continue
         below, above = from_zero(float(values.min()), float(values.max()), NONE)
         limits = (-limit if below < 0 else 0.0, limit if above > 0 else 0.0)

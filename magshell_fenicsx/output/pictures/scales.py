@@ -17,6 +17,7 @@ NEAR = "near"  # those of a distance: what is farther than the limit is grey
 FAR = "0.86"  # that grey
 COLOURS = 257
 CLOSE = 0.16  # of a bar: ticks nearer to its ends give way to the numbers there
+LETTERS = 3.2  # the same on a short bar, in heights of a letter
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,12 @@ def colour_bar(
     from matplotlib.ticker import MaxNLocator
 
     extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
-    few = 3 if axes.get_position().width * figure.get_figwidth() < 16 * rcParams["font.size"] / 72 else 5
+    reach = axes.get_position().width * figure.get_figwidth() * 72 / rcParams["font.size"]  # letters
+    short = orientation == "horizontal" and reach < 16
+    few, close = (3, max(CLOSE, LETTERS / reach)) if short else (5, CLOSE)
     low, high = of.limits
     between = MaxNLocator(few, steps=[1, 2, 5, 10]).tick_values(low, high)
-    inner = [v for v in between if CLOSE < (v - low) / (high - low) < 1 - CLOSE]
+    inner = [v for v in between if close < (v - low) / (high - low) < 1 - close]
     texts, power = numbers([low, *inner, high])
     bar = figure.colorbar(
         ScalarMappable(Normalize(*of.limits), colour_map(of.colours, of.limits)),

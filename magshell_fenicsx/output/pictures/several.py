@@ -27,10 +27,10 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 MOST_KEYS = 2  # of a case in the label of its run
-WIDE = 0.26  # of a shell on a curve, over the axes
+WIDE, TALL = 0.26, 0.34  # of a shell on a curve, over the axes
 GREY = 0.8
-PLACES = [np.array(at) for at in product(np.linspace(0.02, 1 - WIDE - 0.02, 5), np.linspace(0.02, 0.7, 5))]
-COVERED, MET = 4.0, 50.0  # how bad it is to cover all of the curve, or another shell, beside one width of the axes
+EACH_WAY, MARGIN = 9, 0.02  # places that are tried; the room around them, over the axes
+COVERED, MET = 12.0, 50.0  # how bad it is to cover all of the curve, or another shell, beside one width of the axes
 
 
 def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Figure":
@@ -135,9 +135,9 @@ def add_shapes(
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
-        width = max(int(WIDE * box.width), 20)
-        view = Background(surface, camera, width)
-        image = view.plain(GREY)
+        image = Background(surface, camera, max(int(WIDE * box.width), 20)).plain(GREY)
+        if (less := TALL * box.height / image.shape[0]) < 1:
+            image = Background(surface, camera, max(int(less * WIDE * box.width), 8)).plain(GREY)
         size = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         at = np.array(place(row, parts[number].amplitude))
         corner = _free(axes, at, size, taken.setdefault(number, []))
@@ -167,7 +167,7 @@ def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array
         high = low + size
         covered = ((points > low) & (points < high)).all(axis=1).mean()
         met = sum(float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None))) for a, b in taken)
-        out = float(np.clip(high - 1, 0, None).sum())
-        return float(COVERED * covered + MET * (met + out) + np.linalg.norm(low + size / 2 - target))
+        return float(COVERED * covered + MET * met + np.linalg.norm(low + size / 2 - target))
 
-    return np.asarray(min(PLACES, key=fault))
+    along = (np.linspace(MARGIN, max(1 - MARGIN - part, MARGIN), EACH_WAY) for part in size)
+    return np.asarray(min((np.array(at) for at in product(*along)), key=fault))

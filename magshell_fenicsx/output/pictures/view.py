@@ -210,10 +210,15 @@ class InView:
 
     @cached_property
     def _lit(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Cosines between normals and the ways to the eye and to the lamp, at points, and between these ways."""
+        """Cosines between normals and the ways to the eye and the lamp, at points, and that of a place in full light.
+
+        In full light is what faces the eye, or if nothing faces the lamp as well as that, what faces it best: a plate
+        that is seen from its dark side has the colours of the bar too.
+        """
         normals, lamp = self.camera(self._pieces.normals(self._r)), np.array(LAMP) / np.linalg.norm(LAMP)
         eye, to_lamp = (np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp))
-        return eye, to_lamp, float(lamp[2])
+        best = float(np.where(eye < 0, -to_lamp, to_lamp).max(initial=-1.0))
+        return eye, to_lamp, min(float(lamp[2]), best)
 
     @staticmethod
     def of(surface: Surface, camera: Camera, window: Window) -> "InView":
