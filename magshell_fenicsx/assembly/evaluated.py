@@ -88,7 +88,11 @@ class Evaluated:
         return self._system._summed(part)
 
     def residual(self) -> Vector:
-        """dPi/du; the terms that are not numbers are noted in the system's `strange`."""
+        """dPi/du, and what a projection leaves of u; the terms that are not numbers are noted in `strange`."""
+        projection = self._system.projection
+        return self._gradient_of_all() + (projection.beside(self._u) if projection else 0.0)
+
+    def _gradient_of_all(self) -> Vector:
         system = self._present
         factors = system._factors(self._mu)
         if system.noise is None:

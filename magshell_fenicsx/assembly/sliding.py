@@ -1,7 +1,8 @@
 """Supports in any direction, imposed by a projection.
 
-With the projector P of every such node, u is replaced by P u. The residual becomes P b and the tangent
-P K P + (I - P), whose number of negative eigenvalues is that of K for admissible displacements.
+With the projector P of every such node, u is replaced by P u. The residual becomes P b + (I - P) u and the tangent
+P K P + (I - P), whose number of negative eigenvalues is that of K for admissible displacements. Without (I - P) u
+nothing would hold what rounding leaves of u there, which a path magnifies where it extrapolates.
 """
 
 from collections.abc import Sequence
@@ -68,6 +69,12 @@ class Projection:
         here = self._nodes < len(u) // 3
         nodes, x = self._nodes[here], u.reshape(-1, 3)
         x[nodes] = np.einsum("nij,nj->ni", self._P[here], x[nodes])
+
+    def beside(self, u: Array) -> Array:
+        """(I - P) u of owned nodes."""
+        admissible = np.array(u)
+        self.project(admissible)
+        return u - admissible
 
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
         """P K P + (I - P); the same object while K is the same, which contact makes another. Collective."""
