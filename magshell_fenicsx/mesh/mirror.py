@@ -119,7 +119,8 @@ class Mirror:
     def keeps_lines(self, along: Array | None) -> bool:
         """Whether it maps lines along a vector (3,), of none along the meridians of e3, onto such lines."""
         if along is None:
-            return self.keeps_lines(np.eye(3)[2]) and bool(abs(self.offset) < STRAIGHT or abs(self.normal[2]) > STRAIGHT)
+            through = abs(self.offset) < STRAIGHT or abs(float(self.normal[2])) > STRAIGHT
+            return through and self.keeps_lines(np.eye(3)[2])
         unit = along / np.linalg.norm(along)
         cosine, sine = abs(float(unit @ self.normal)), float(np.linalg.norm(np.cross(unit, self.normal)))
         return min(cosine, sine) < STRAIGHT
