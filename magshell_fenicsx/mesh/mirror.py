@@ -116,6 +116,15 @@ class Mirror:
         """Mirrored places (..., 3)."""
         return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
 
+    def keeps_lines(self, along: Array | None) -> bool:
+        """Whether it maps lines along a vector (3,), of none along the meridians of e3, onto such lines."""
+        if along is None:
+            through = abs(self.offset) < STRAIGHT or abs(float(self.normal[2])) > STRAIGHT
+            return through and self.keeps_lines(np.eye(3)[2])
+        unit = along / np.linalg.norm(along)
+        cosine, sine = abs(float(unit @ self.normal)), float(np.linalg.norm(np.cross(unit, self.normal)))
+        return min(cosine, sine) < STRAIGHT
+
     def beyond(self, x: Array) -> Array:
         """Distances (...) from the plane, positive in the half that is modelled."""
         return np.asarray(np.asarray(x) @ self.normal - self.offset)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import Section, given, or_number
-from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.part import Ability, Context
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.laminate import Laminate
@@ -206,16 +206,10 @@ def _leaves(section: LaminateSection, geometry: str) -> Leaves:
     elif unit is not None and np.hypot(*unit[:2]) > NONE:
         reason = "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
 
-    def mirrors(mirror: Mirror) -> bool:
-        if section.twists:
-            return False
-        if unit is None:
-            return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-        across = abs(float(unit @ mirror.normal))
-        return min(across, abs(across - 1)) <= NONE
-
     beside = () if unit is None else tuple(float(np.arctan2(unit[1], unit[0])) + turn for turn in (0.0, np.pi / 2))
-    return Leaves(reason, mirrors=mirrors, azimuths=() if section.twists else beside)
+    if section.twists:
+        return Leaves(reason, mirrors=nothing)
+    return Leaves(reason, mirrors=lambda mirror: mirror.keeps_lines(unit), azimuths=beside)
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:

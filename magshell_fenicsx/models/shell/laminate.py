@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered
 
 Array = NDArray[np.float64]
 SAME = 1e-6  # of directions
@@ -48,13 +48,7 @@ class Laminate:
 
     def mirrored(self, plane: Mirror) -> bool:
         """Whether a plane mirrors plies that do not twist: it is along or across their directions everywhere."""
-        up = abs(float(plane.normal[2]))
-        if self.isotropic:
-            return True
-        if self.direction is None:
-            return up > 1 - SAME or (up < SAME and abs(plane.offset) < SAME)
-        across = abs(float(self.direction @ plane.normal)) / float(np.linalg.norm(self.direction))
-        return min(across, abs(across - 1)) < SAME
+        return self.isotropic or plane.keeps_lines(self.direction)
 
 
 @dataclass(frozen=True)
@@ -110,10 +104,6 @@ class Laminated(Law):
         return replace(self, direction=(one, two))
 
     @property
-    def linear(self) -> Law:
-        return self
-
-    @property
     def bending_stiffness(self) -> Scalar:
         return Koiter(self.h, self.number, self.t, self.e).bending_stiffness
 
@@ -124,9 +114,6 @@ class Laminated(Law):
     def stress(self, E: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
         return frame.raised(self.e * self.t, _stress(self.A, frame.strain(E)))
-
-    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        return self.stress(change, up)
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         frame = _Frame(self.direction, up)
@@ -167,7 +154,7 @@ class _Frame:
         (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         raised = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
         over, det = (c1 * raised[0] + c2 * raised[1]) ** -0.5, a11 * a22 - a12**2
-        self._up, self._det = (a11, a12, a22), det
+        self._up = up
         self.t1 = raised[0] * over, raised[1] * over
         self.t2 = -(det**0.5) * c2 * over, det**0.5 * c1 * over
 
@@ -182,8 +169,7 @@ class _Frame:
 
     def twice(self, across: tuple[Scalar, Scalar]) -> Triple:
         """The same of c c, where the covector c has these components with index up."""
-        (b1, b2), (a11, a12, a22), det = across, self._up, self._det
-        c = (a22 * b1 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
+        c = lowered(across, self._up)
         one, two = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return one**2, two**2, 2 * one * two
 

@@ -73,14 +73,14 @@ class Law(ABC):
         return replace(self, e=e * self.e)
 
     @property
-    @abstractmethod
     def linear(self) -> "Law":
         """The same at small strains."""
+        return self
 
     @property
-    @abstractmethod
     def bending_stiffness(self) -> Scalar:
         """D/(E h R^2) at small strains."""
+        return self.linear.bending_stiffness
 
     @abstractmethod
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
@@ -94,9 +94,13 @@ class Law(ABC):
     def stress(self, E: Tensor, up: Tensor) -> Components:
         """The derivative of `membrane` by E."""
 
-    @abstractmethod
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
         """The stress of E and a change of it, less that of E."""
+        if self.linear is self:
+            return self.stress(change, up)
+        before, after = self.stress(E, up), self.stress(E + change, up)
+        S11, S12, S22 = (b - a for a, b in zip(before, after, strict=True))
+        return S11, S12, S22
 
     @abstractmethod
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
@@ -129,10 +133,6 @@ class Koiter(Law):
         return replace(self, e=e * self.e, number=nu)
 
     @property
-    def linear(self) -> "Koiter":
-        return self
-
-    @property
     def bending_stiffness(self) -> Scalar:
         return self.e * self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
 
@@ -144,9 +144,6 @@ class Koiter(Law):
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         return self._scaled(self.e * self.t / (1 - self.nu**2), E, up)
-
-    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        return self.stress(change, up)
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         return self._scaled(self.bending_stiffness, K, up)
@@ -185,6 +182,13 @@ def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
 def trace(S: Tensor, up: Tensor) -> Scalar:
     """S^i_i."""
     return up[..., 0, 0] * S[..., 0, 0] + 2 * up[..., 0, 1] * S[..., 0, 1] + up[..., 1, 1] * S[..., 1, 1]
+
+
+def lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
+    """The covector with these components with index up."""
+    a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+    det = a11 * a22 - a12**2
+    return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
 
 
 def work(S: Components, T: Tensor) -> Scalar:

@@ -17,7 +17,7 @@ from typing import ClassVar
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, trace
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered, trace
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,6 @@ class Rubber(Law):
     @property
     def linear(self) -> Koiter:
         return Koiter(self.h, 0.5, self.t, self.e)
-
-    @property
-    def bending_stiffness(self) -> Scalar:
-        return self.linear.bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         at = _Stretched(E, up)
@@ -53,11 +49,6 @@ class Rubber(Law):
         )
         return S11, S12, S22
 
-    def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        before, after = self.stress(E, up), self.stress(E + change, up)
-        S11, S12, S22 = (b - a for a, b in zip(before, after, strict=True))
-        return S11, S12, S22
-
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         of_square, of_mixed, of_det = self._stiffness(at := _Stretched(E, up))
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
@@ -76,12 +67,12 @@ class Rubber(Law):
         return M11, M12, M22
 
     def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        M, (c1, c2) = self.moment(E, K, up), _lowered(across, up)
+        M, (c1, c2) = self.moment(E, K, up), lowered(across, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         of_square, of_mixed, _ = self._stiffness(at := _Stretched(E, up))  # c c has no determinant
-        (c1, c2), (a11, a12, a22) = _lowered(across, up), at.inverse
+        (c1, c2), (a11, a12, a22) = lowered(across, up), at.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return of_square * T**2 - of_mixed * T * square
 
@@ -125,13 +116,6 @@ class _Stretched:
     def deformed_trace(self, K: Tensor) -> Scalar:
         a11, a12, a22 = self.inverse
         return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
-
-
-def _lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """The covector with these components with index up."""
-    a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
-    det = a11 * a22 - a12**2
-    return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
 
 
 def _root(x: Scalar) -> Scalar:

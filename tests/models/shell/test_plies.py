@@ -9,6 +9,7 @@ from along import check, difference
 from conftest import disc, hemisphere, random_displacement
 from plies import laminate, ply, section
 
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.laminate import Laminate
 from magshell_fenicsx.models.shell.parameters import Condition, Material
@@ -44,6 +45,15 @@ def test_a_ply_is_a_turned_tensor() -> None:
     assert pytest.approx(np.array(expected) / 2, rel=1e-12) == A
     assert pytest.approx(0) == B
     assert pytest.approx(A / 12) == D
+
+
+def test_a_plane_nearly_across_the_fibres_is_no_mirror() -> None:
+    """1e-3 rad off, of which the cosine is 1 to 5e-7; exactly along and across it is one."""
+    plies = Laminate(CROSS.matrices(1.0), np.array([2.0, 0.0, 0.0]))
+    assert [plies.mirrored(Mirror.of(np.array(n))) for n in ([1, 0, 0], [0, 1, 0], [1, 1e-3, 0])] == [True, True, False]
+    of_meridians = Laminate(CROSS.matrices(1.0), None)
+    planes = [Mirror.of(np.array([1.0, 2.0, 0.0])), Mirror.of(np.array([1.0, 0, 0]), 0.1), Mirror.of(np.eye(3)[2], 0.1)]
+    assert [of_meridians.mirrored(plane) for plane in planes] == [True, False, True]
 
 
 def test_cross_ply() -> None:

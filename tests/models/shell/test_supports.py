@@ -137,6 +137,19 @@ def test_sectors_between_oblique_symmetry_planes() -> None:
     assert found[1:] == pytest.approx([found[0]] * 2, rel=1e-9)
 
 
+def test_a_path_stays_on_oblique_symmetry_planes() -> None:
+    """A sector of a strongly stretched cap: what rounding leaves beside its planes does not grow along the path."""
+    shell = {"geometry": "cap", "polar": 60, "radius": 1, "thickness": 0.01, "poisson_ratio": 0.5}
+    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": -4.5, "points": 1}
+    mesh = {"degree": 2, "refinement": 0.3}
+    data = {"shell": shell, "boundary": {"rim": "clamped"}, "symmetry": 6, "mesh": mesh, "loading": loading}
+    sector = Scene(Case.from_source(Source("test", data)))
+    *_, last = follow(sector)
+    assert last.label == "target"
+    u = last.point.state.u
+    assert np.abs(sector.model.system.held(u) - u).max() < 1e-15
+
+
 def test_a_remanence_without_value_is_refused() -> None:
     """At a node, and at places that a problem does not look at by samples alone."""
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "expression", "components": ["0*x", "0*x", "1/(3*x - 1)"]}}
