@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
-from magshell_fenicsx.parts.magnetism.pairs import Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -85,7 +85,9 @@ class Kind:
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
         t = self._shape.thickness(self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape)))[0]
-        t, q = (np.concatenate([c * each for c in of]) for each, of in ((t, self._copies.up), (q, self._copies.charges)))
+        t, q = (
+            np.concatenate([c * each for c in of]) for each, of in ((t, self._copies.up), (q, self._copies.charges))
+        )
         return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t, q)
 
 
@@ -112,7 +114,7 @@ class Charged:
         edges: Ints,
         comm: MPI.Comm,
         near: Near | None = None,
-        copies: Copies = Copies(),
+        copies: Copies = ALL,
     ) -> None:
         self._pairs, self._h, self._near = Pairs(comm), shape.h, near
         kinds = [Kind(shape, np.arange(len(shape.r0)), copies)]
@@ -164,7 +166,9 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 rows = one.number[both[:, 0]], other.number[both[:, 1]]
                 there = (rows[0] >= 0) & (rows[1] >= 0)
-                left, right = ((kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True))
+                left, right = (
+                    (kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True)
+                )
                 energy += part * self._pairs.add(nodes, both[there], int(there.sum()), left, right, gradient, stiffness)
         for number, kind in product(np.unique(which), self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)

@@ -19,7 +19,7 @@ from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
-from magshell_fenicsx.parts.magnetism.pairs import Copies, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
 from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ class InteractionTerm:
     def _copies(self) -> Copies:
         """What is modelled, and the images that make the whole of a half or a sector."""
         if self._model.multiplicity == 1:
-            return Copies()
+            return ALL
         own, mirror = own_field(self._sight), self._sight.mirror
         assert mirror
         return Copies(tuple(mirror.images), own.sign_of_images({}))
@@ -195,7 +195,9 @@ class InteractionTerm:
             return np.asarray(self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
         graph = coo_array((ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size))
-        return np.asarray(np.unique(connected_components(graph, directed=False)[1][corners[:, 0]], return_inverse=True)[1])
+        return np.asarray(
+            np.unique(connected_components(graph, directed=False)[1][corners[:, 0]], return_inverse=True)[1]
+        )
 
     @property
     def _sight(self) -> Sight:

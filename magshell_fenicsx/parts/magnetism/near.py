@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
-from magshell_fenicsx.parts.magnetism.pairs import Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.touching import (
     APART,
     ENDS,
@@ -108,7 +108,7 @@ class Near:
         edges: Ints,
         own: range,
         comm: MPI.Comm,
-        copies: Copies = Copies(),
+        copies: Copies = ALL,
     ) -> None:
         self._pairs, self._copies = Pairs(comm), copies
         self._shape, self._corners, self._own = shape, corners, own
@@ -200,9 +200,7 @@ class Near:
         for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
             made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
-        most = max(
-            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0
-        )
+        most = max((float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0)
         for each in made:
             if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
                 yield each

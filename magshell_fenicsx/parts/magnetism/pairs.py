@@ -1,4 +1,4 @@
-"""Sums over pairs of charged cells in C: their energy, its gradient, and its second derivatives, LANES pairs at once."""
+"""Sums over pairs of charged cells in C: energy, gradient and second derivatives, `LANES` pairs at once."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,9 @@ class Copies:
     def of(self, nodes: Array) -> Array:
         """The nodes (copies cells, k, 3) of all."""
         return np.concatenate([image.of(nodes) for image in self.images])
+
+
+ALL = Copies()  # of a shell that is modelled whole
 
 
 @dataclass(frozen=True)
@@ -189,7 +192,18 @@ class Pairs:
         found = np.empty((len(own), len(nodes)), dtype=np.int8)
         given = [p(each) for each in (nodes, centre, normal, radius, apart)]
         failed = self._lib.rules(
-            len(nodes), own.start, own.stop, nodes.shape[1], *given, h, space, above, len(least), p(least), worst, p(found)
+            len(nodes),
+            own.start,
+            own.stop,
+            nodes.shape[1],
+            *given,
+            h,
+            space,
+            above,
+            len(least),
+            p(least),
+            worst,
+            p(found),
         )
         return None if failed else found
 

@@ -6,6 +6,8 @@ from typing import Any
 import gmsh
 import numpy as np
 import pytest
+from command import magshell, read_path
+from interrupted import start, wait_for_rows
 from mpi4py import MPI
 from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
 from test_own_field import sphere_of_triangles
@@ -139,7 +141,7 @@ def halves(file: Path, symmetry: str, polar: float, azimuth: float, **sections: 
 @pytest.mark.slow
 @pytest.mark.parametrize(("polar", "azimuth", "error"), [(40, 0, 5e-3), (90, 90, 1e-5)])  # mirrored, or opposite
 def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error: float) -> None:
-    """A half in its images' field is the half of the whole, to the error of rules: energy 1e-5, symmetric and odd tangents.
+    """A half in its images' field is the half of the whole, to the error of rules: energy 1e-5, even and odd tangents.
 
     Cells of the whole's other half begin at other corners than images do, which shows the error of rules for cells that
     touch: largest in the tangent, of charged faces. Differences of the half's own energy and forces: 1e-6.
@@ -174,6 +176,37 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
         V[there], V[here] = sign * v @ S, v
         k = rows_of(system, states[1], term if sign > 0 else term.antisymmetric())
         assert 2 * v.ravel() @ k @ v.ravel() == pytest.approx(V.ravel() @ K @ V.ravel(), rel=error)
+
+
+CAP = """
+shell: {geometry: cap, radius: 25 mm, thickness: 1.2 mm, polar: 60, youngs_modulus: 0.3 MPa, poisson_ratio: 0.49}
+boundary: {rim: clamped}
+magnetic: {remanent: {polar: 0, flux_density: 150 mT}, interaction: all}
+loading: {kind: pressure, control: load, points: 2, pressure: 200 Pa, until: target}
+mesh: {degree: 2, size: 8 mm}
+symmetry: half
+"""
+
+
+@pytest.mark.slow
+def test_ranks_and_resume(tmp_path: Path) -> None:
+    """A half in its own and its image's field: the same path on 1, 2 and 3 ranks, and of a run that goes on."""
+    (tmp_path / "case.yaml").write_text(CAP)
+    run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
+    wait_for_rows(run, tmp_path / "again", 2)
+    run.terminate()
+    run.communicate()
+    done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again", "--resume", ranks=1)
+    assert done.returncode == 0, done.stderr
+    paths = [read_path(tmp_path / "again")]
+    for ranks in (1, 2, 3):
+        done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / str(ranks), ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        paths.append(read_path(tmp_path / str(ranks)))
+    for other in paths[1:]:
+        for name in ("interaction", "p_over_pc", "w_over_h", "energy", "magnetic"):
+            first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
+            assert values == pytest.approx(first, rel=1e-7, abs=1e-13), name
 
 
 def smooth(x: Array, sign: float) -> Array:
