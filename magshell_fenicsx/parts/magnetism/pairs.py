@@ -25,8 +25,7 @@ FUNCTIONS = """
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
         const uint8_t *, double, double, double, int64_t, const double *, double, int8_t *);
 """
-KINDS = {np.dtype(np.float64): "double[]", np.dtype(np.int64): "int64_t[]"}
-KINDS |= {np.dtype(np.uint8): "uint8_t[]", np.dtype(np.int8): "int8_t[]"}
+KINDS = {"float64": "double[]", "int64": "int64_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
 
 
 @dataclass(frozen=True)
@@ -209,7 +208,7 @@ class Pairs:
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype], array)
+        return self._ffi.from_buffer(KINDS[array.dtype.name], array)
 
 
 def _filled(each: Ints, idle: int) -> Ints:
