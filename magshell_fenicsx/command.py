@@ -45,7 +45,7 @@ class Command(typer.core.TyperCommand):
 class Commands(typer.Typer):
     """Commands of a program."""
 
-    def command(self, *args: Any, **kwargs: Any) -> Any:
+    def command[F: Callable[..., Any]](self, *args: Any, **kwargs: Any) -> Callable[[F], F]:
         return super().command(*args, cls=Command, **kwargs)
 
 

@@ -300,6 +300,7 @@ class ShellModel(Thin):
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
+        terms = [t.antisymmetric() if isinstance(t, InteractionTerm) else t for t in terms]
         system = self.system
         return AntisymmetricModes(
             FiniteElementSystem(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
-from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -47,11 +47,13 @@ class Touching(ValueError):
 class Kind:
     """The faces of all cells, or their edges with one local number that are charged."""
 
-    def __init__(self, shape: Shape, cells: Ints, edge: int | None = None) -> None:
-        self.cells, self._edge, self._shape = cells, edge, shape
+    def __init__(self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None) -> None:
+        self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
         self.family = Faces(shape, cells) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
-        self.number = np.full(len(shape.r0), -1)
-        self.number[cells] = np.arange(len(cells))
+        count = len(copies.images)
+        self.cells = np.concatenate([cells + copy * len(shape.r0) for copy in range(count)])
+        self.number = np.full(count * len(shape.r0), -1)
+        self.number[self.cells] = np.arange(len(self.cells))
         self._rules: dict[int, Points] = {}
 
     def rule(self, which: int) -> Points:
@@ -82,7 +84,10 @@ class Kind:
 
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
-        t = self._shape.thickness(self.cells, np.broadcast_to(X, (len(self.cells), *X.shape)))[0]
+        t = self._shape.thickness(self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape)))[0]
+        t, q = (
+            np.concatenate([c * each for c in of]) for each, of in ((t, self._copies.up), (q, self._copies.charges))
+        )
         return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t, q)
 
 
@@ -92,9 +97,9 @@ class Charged:
     Parameters
     ----------
     shape
-        All cells.
+        All cells that are modelled.
     parts
-        (cells,) the number of each one's part.
+        (copies cells,) the number of each one's part.
     cells, edges
         Edges that may be charged, by cell and local number.
     near
@@ -102,11 +107,18 @@ class Charged:
     """
 
     def __init__(
-        self, shape: Shape, parts: Ints, cells: Ints, edges: Ints, comm: MPI.Comm, near: Near | None = None
+        self,
+        shape: Shape,
+        parts: Ints,
+        cells: Ints,
+        edges: Ints,
+        comm: MPI.Comm,
+        near: Near | None = None,
+        copies: Copies = ALL,
     ) -> None:
         self._pairs, self._h, self._near = Pairs(comm), shape.h, near
-        kinds = [Kind(shape, np.arange(len(shape.r0)))]
-        kinds += [Kind(shape, cells[edges == edge], edge) for edge in range(3) if (edges == edge).any()]
+        kinds = [Kind(shape, np.arange(len(shape.r0)), copies)]
+        kinds += [Kind(shape, cells[edges == edge], copies, edge) for edge in range(3) if (edges == edge).any()]
         sizes = [kind.charged(0) for kind in kinds]
         self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if size > NOTHING * max(sizes)]
         self._apart = np.array(parts[:, None] != parts, dtype=np.uint8)
@@ -135,7 +147,7 @@ class Charged:
         Parameters
         ----------
         nodes
-            (cells, k, 3) the deformed ones.
+            (copies cells, k, 3) the deformed ones; own cells are among the first copy.
         stiffness
             Gets the second derivatives by the nodes of own cells and those of all cells.
 
@@ -154,7 +166,9 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 rows = one.number[both[:, 0]], other.number[both[:, 1]]
                 there = (rows[0] >= 0) & (rows[1] >= 0)
-                left, right = ((kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True))
+                left, right = (
+                    (kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True)
+                )
                 energy += part * self._pairs.add(nodes, both[there], int(there.sum()), left, right, gradient, stiffness)
         for number, kind in product(np.unique(which), self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)

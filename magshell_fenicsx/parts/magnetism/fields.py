@@ -20,7 +20,7 @@ from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Mode
 from magshell_fenicsx.quantities.quantity import Given
 from magshell_fenicsx.shape.revolved import SurfaceSection
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, nothing
+from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -294,8 +294,9 @@ class MagneticSection(Section, Ability):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
 
-        acts = [] if self.interaction == "none" else [Leaves("parts act on each other", mirrors=nothing)]
-        return acts + (leaves(context, outline) if strength(context) or context.sections.get("sensors") else [])
+        acts = [] if self.interaction == "none" else [Leaves("parts act on each other")]
+        seen = strength(context) or context.sections.get("sensors") or acts
+        return acts + (leaves(context, outline) if seen else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import

@@ -1,5 +1,6 @@
 """Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees of it."""
 
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
 from magshell_fenicsx.input.source import CaseError
@@ -16,7 +19,7 @@ from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
-from magshell_fenicsx.parts.magnetism.pairs import Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
 from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
+SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB
 
 
@@ -45,14 +49,8 @@ class InteractionTerm:
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
-        self._cells = CellsOfAll.of(V)
-        self._parts = self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]])  # of each cell
+        self._cells, self._odd = CellsOfAll.of(V), False
         unknowns = 3 * V.dofmap.index_map.size_global
-        if not of.itself and self._parts.max() == 0:
-            raise CaseError(
-                "magnetic.interaction: others: acts between parts of a mesh file that are not connected, and the shell "
-                "is one part: take interaction: all, or a mesh of several parts"
-            )
         if unknowns > LARGEST:
             raise CaseError(
                 f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on each other, "
@@ -61,8 +59,14 @@ class InteractionTerm:
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
 
+    def antisymmetric(self) -> "InteractionTerm":
+        """The term for displacements that are opposite in the images, added to symmetric ones."""
+        other = copy(self)
+        other._odd = True
+        return other
+
     def refuse_near(self) -> None:
-        """See that the undeformed parts are as far from each other as their cells can tell; collective.
+        """See that there are several parts, undeformed as far from each other as their cells can tell; collective.
 
         Raises
         ------
@@ -70,6 +74,11 @@ class InteractionTerm:
             On every rank, if they are not.
         """
         near = False
+        if not self._itself and self._parts.max() == 0:
+            raise CaseError(
+                "magnetic.interaction: others: acts between parts of a mesh file that are not connected, and the shell "
+                "is one part: take interaction: all, or a mesh of several parts"
+            )
         try:
             nodes = self._nodes()
             self._charged.rules(nodes, self._cells.own)
@@ -100,9 +109,13 @@ class InteractionTerm:
 
     def add_rows(self, rows: Array, factor: float) -> None:
         """See `assembly.whole.WholeTerm`; collective."""
-        own, row_of = self._cells.own, np.full(self._cells.nodes.shape, -1)
+        own, images = self._cells.own, self._copies.images
+        column_of = np.ascontiguousarray(np.tile(self._cells.nodes, (len(images), 1)), np.int64)
+        row_of = np.full(column_of.shape, -1)
         row_of[own.start : own.stop] = self._u.function_space.dofmap.list[: len(own)]
-        stiffness = Stiffness(rows, factor * self._scale, row_of, np.ascontiguousarray(self._cells.nodes, np.int64))
+        turn = np.stack([image.Q for image in images])
+        turn[1:] *= -1.0 if self._odd else 1.0
+        stiffness = Stiffness(rows, factor * self._scale, row_of, column_of, turn)
         try:
             self._charged.evaluate(self._nodes(), own, stiffness)
         except Touching:
@@ -121,7 +134,7 @@ class InteractionTerm:
         return self._seen[1:]
 
     def _nodes(self) -> Array:
-        """(cells, k, 3) the deformed nodes of all cells; what is charged is renewed where it has changed."""
+        """(copies cells, k, 3) the deformed nodes of all cells; what is charged is renewed where it has changed."""
         r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
@@ -129,19 +142,19 @@ class InteractionTerm:
             self._given, self._seen = given, None
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
-        return np.asarray((r0 + u)[self._cells.nodes])
+        return self._copies.of((r0 + u)[self._cells.nodes])
 
     @cached_property
     def _charged(self) -> Charged:
         shape, cells, edges = self._all()
-        return Charged(shape, self._parts, cells, edges, self._comm, self._near)
+        return Charged(shape, self._parts, cells, edges, self._comm, self._near, self._copies)
 
     @cached_property
     def _near(self) -> Near | None:
         shape, cells, edges = self._all()
         if not self._itself:
             return None
-        return Near(shape, self._cells.nodes[:, :3], cells, edges, self._cells.own, self._comm)
+        return Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies)
 
     def _all(self) -> tuple[Shape, Ints, Ints]:
         """The cells of all ranks, and their edges that may be charged; collective."""
@@ -153,6 +166,40 @@ class InteractionTerm:
         own_cells, every = np.asarray(cells) + self._cells.own.start, self._comm
         return everywhere, over_ranks(every, own_cells), over_ranks(every, np.asarray(edges))
 
+    @cached_property
+    def _copies(self) -> Copies:
+        """What is modelled, and the images that make the whole of a half or a sector."""
+        if self._model.multiplicity == 1:
+            return ALL
+        own, mirror = own_field(self._sight), self._sight.mirror
+        assert mirror
+        return Copies(tuple(mirror.images), own.sign_of_images({}))
+
+    @cached_property
+    def _corners(self) -> Ints:
+        """(copies cells, 3) numbers of corners: one where an image is another one, on a mirror plane; collective."""
+        r0, corners = whole(self._model.r0), self._cells.nodes[:, :3]
+        places = self._copies.of(r0[None])
+        numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
+        for copy_, x in enumerate(places):
+            for before in range(copy_):
+                same = np.abs(x - places[before]).max(axis=1) < SAME
+                numbers[copy_][same] = numbers[before][same]
+        return np.concatenate([each[corners] for each in numbers])
+
+    @cached_property
+    def _parts(self) -> Ints:
+        """(copies cells,) the part of each cell; collective."""
+        V, corners, several = self._u.function_space, self._corners, self._copies.images[1:]
+        if not several:
+            return np.asarray(self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]]))
+        ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
+        graph = coo_array((ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size))
+        return np.asarray(
+            np.unique(connected_components(graph, directed=False)[1][corners[:, 0]], return_inverse=True)[1]
+        )
+
     @property
     def _sight(self) -> Sight:
-        return Sight(self._model, 1.0, 1.0, None, 0.0, False)
+        mirror = self._model.mirror if self._model.multiplicity > 1 else None  # type: ignore[attr-defined]  # of shells
+        return Sight(self._model, 1.0, 1.0, mirror, 0.0, False)

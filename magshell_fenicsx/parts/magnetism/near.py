@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
-from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.touching import (
     APART,
     ENDS,
@@ -91,21 +91,30 @@ class Near:
     Parameters
     ----------
     shape
-        All cells.
+        All cells that are modelled.
     corners
-        (cells, 3) numbers of their corners.
+        (copies cells, 3) numbers of the corners of all copies.
     cells, edges
         Edges that may be charged, by cell and local number.
     own
         The cells of this rank; pairs without one of them are left to others.
     """
 
-    def __init__(self, shape: Shape, corners: Ints, cells: Ints, edges: Ints, own: range, comm: MPI.Comm) -> None:
-        self._pairs = Pairs(comm)
+    def __init__(
+        self,
+        shape: Shape,
+        corners: Ints,
+        cells: Ints,
+        edges: Ints,
+        own: range,
+        comm: MPI.Comm,
+        copies: Copies = ALL,
+    ) -> None:
+        self._pairs, self._copies = Pairs(comm), copies
         self._shape, self._corners, self._own = shape, corners, own
-        strips = np.zeros((len(corners), 3), dtype=bool)
+        strips = np.zeros((len(shape.r0), 3), dtype=bool)
         strips[cells, edges] = True
-        self._strips = strips
+        self._strips = np.tile(strips, (len(copies.images), 1))
         sides = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
         self._scale = float(shape.h / np.median(sides))
         self._heights = heights(Faces(shape, np.arange(1)))
@@ -191,9 +200,7 @@ class Near:
         for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
             made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
-        most = max(
-            (float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0
-        )
+        most = max((float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0)
         for each in made:
             if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
                 yield each
@@ -251,8 +258,10 @@ class Near:
     def _found(self, cells: Ints, points: Places, edge: int | None) -> tuple[Array, Array, Array, Array]:
         """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
         shape, X = self._shape, points.X
+        copy, cells = np.divmod(cells, len(shape.r0))
+        up, charge = (each[copy][:, None] for each in (self._copies.up, self._copies.charges))
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
-        t = shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
+        t = up * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
         if points.at is None:
             q = np.einsum("mj,njl->nml", NODES.tabulate(0, X)[0, :, :, 0], self._on_faces[cells], optimize=True)
             layers = np.broadcast_to(self._heights, (len(X), len(self._heights)))
@@ -261,12 +270,12 @@ class Near:
             basis = np.einsum("ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP)))
             basis = basis.reshape(len(X), -1)
             q, layers = (self._on_strips[edge][cells] @ basis.T)[..., None], points.at[:, 1:] - 0.5
-        return T, np.ascontiguousarray(layers), np.ascontiguousarray(t), points.weights[:, None] * q
+        return T, np.ascontiguousarray(layers), np.ascontiguousarray(t), points.weights[:, None] * charge[..., None] * q
 
     @cached_property
     def _on_faces(self) -> Array:
-        """(cells, n, layers) charges per area of the reference triangle at nodes."""
-        X, cells = NODES.points, np.arange(len(self._corners))
+        """(cells, n, layers) charges per area of the reference triangle at nodes of what is modelled."""
+        X, cells = NODES.points, np.arange(len(self._shape.r0))
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         each = max(1, CHUNK // len(X))
         parts = [cells[first : first + each] for first in range(0, len(cells), each)]
@@ -277,9 +286,9 @@ class Near:
         """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
         (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
         at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
-        found: list[Array] = [np.zeros((len(self._corners), len(at))) for _ in range(3)]
+        found: list[Array] = [np.zeros((len(self._shape.r0), len(at))) for _ in range(3)]
         for edge, into in enumerate(found):
-            cells = np.flatnonzero(self._strips[:, edge])
+            cells = np.flatnonzero(self._strips[: len(self._shape.r0), edge])
             if len(cells):
                 sides = Sides(self._shape, cells, np.full(len(cells), edge))
                 into[cells] = sides.at(Boxes.whole(len(cells)), at, np.ones(len(at))).q[..., 0]

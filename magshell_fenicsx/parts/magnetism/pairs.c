@@ -192,13 +192,14 @@ INLINE void sum_up(const Point *p, int bent, int64_t idle, const int64_t *at, in
    qR (rows, P, M, S), eR; their derivatives are added to gradient (cells, k, 3) and `onto`, see `own`. Or `same` ones
    for all: without the axis P, and added to sR (rows, M, SUMS). Unless `onto` is NULL, second derivatives by the nodes of
    both cells times `factor` are added to rows (.., 3, columns, 3), in the row row_of (cells, k) if that is not negative,
-   and the column column_of (cells, k). */
+   and the column column_of (cells, k) of the node that a copy is the image of by turn (copies, 3, 3); each copy has
+   `modelled` cells. */
 FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *both, int64_t nodes_of_cell,
                   const double *nodes, int64_t P, int64_t L, const double *TL, const double *hL, const double *tL,
                   const double *qL, double *sL, const int64_t *eL, int64_t M, int64_t S, const double *TR,
                   const double *hR, const double *tR, const double *qR, double *sR, const int64_t *eR, int64_t same,
                   double *gradient, double factor, double *onto, double *rows, int64_t columns, const int64_t *row_of,
-                  const int64_t *column_of)
+                  const int64_t *column_of, const double *turn, int64_t modelled)
 {
     const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2, bent = onto != 0;
     const int64_t all = same ? M : P * M;
@@ -296,18 +297,23 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
             to = onto + half * right_cell[c];
             for (int l = 0; l < half && !same; ++l)
                 to[l] += HR[l][c];
+            const double *first = turn + 9 * (left_cell[c] / modelled), *second = turn + 9 * (right_cell[c] / modelled);
             for (int l = 0; l < k; ++l)
                 for (int m = 0; m < k; ++m) {
                     const int64_t a = row_of[k * left_cell[c] + l], b = row_of[k * right_cell[c] + m];
                     const int64_t i0 = column_of[k * left_cell[c] + l], j0 = column_of[k * right_cell[c] + m];
+                    double h[3][3];
                     for (int i = 0; i < 3; ++i)
-                        for (int j = 0; j < 3; ++j) {
-                            const double h = factor * HX[(3 * l + i) * 3 * k + j * k + m][c];
-                            if (a >= 0)
-                                rows[((3 * a + i) * columns + j0) * 3 + j] += h;
-                            if (b >= 0)
-                                rows[((3 * b + j) * columns + i0) * 3 + i] += h;
-                        }
+                        for (int j = 0; j < 3; ++j)
+                            h[i][j] = factor * HX[(3 * l + i) * 3 * k + j * k + m][c];
+                    for (int i = 0; i < 3 && a >= 0; ++i)
+                        for (int j = 0; j < 3; ++j)
+                            rows[((3 * a + i) * columns + j0) * 3 + j] +=
+                                h[i][0] * second[j] + h[i][1] * second[3 + j] + h[i][2] * second[6 + j];
+                    for (int j = 0; j < 3 && b >= 0; ++j)
+                        for (int i = 0; i < 3; ++i)
+                            rows[((3 * b + j) * columns + i0) * 3 + i] +=
+                                h[0][j] * first[i] + h[1][j] * first[3 + i] + h[2][j] * first[6 + i];
                 }
         }
     }

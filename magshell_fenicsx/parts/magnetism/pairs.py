@@ -1,4 +1,4 @@
-"""Sums over pairs of charged cells in C: their energy, its gradient, and its second derivatives, LANES pairs at once."""
+"""Sums over pairs of charged cells in C: energy, gradient and second derivatives, `LANES` pairs at once."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
@@ -18,14 +19,46 @@ FUNCTIONS = """
     double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *,
         const double *, const double *, const double *, double *, const int64_t *, int64_t, int64_t, const double *,
         const double *, const double *, const double *, double *, const int64_t *, int64_t, double *, double, double *,
-        double *, int64_t, const int64_t *, const int64_t *);
+        double *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
     void points(int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, const double *, const double *,
         double *, double *);
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
         const uint8_t *, double, double, double, int64_t, const double *, double, int8_t *);
 """
-KINDS = {np.dtype(np.float64): "double[]", np.dtype(np.int64): "int64_t[]"}
-KINDS |= {np.dtype(np.uint8): "uint8_t[]", np.dtype(np.int8): "int8_t[]"}
+KINDS = {"float64": "double[]", "int64": "int64_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
+
+
+@dataclass(frozen=True)
+class Copies:
+    """What is modelled and its images, which make the whole; cells of all are counted one copy after the other.
+
+    Attributes
+    ----------
+    images
+        The first is what is modelled itself.
+    charge
+        1 if charges of mirrored images are those of what is modelled, -1 if they are opposite.
+    """
+
+    images: tuple[Image, ...] = (Image(np.eye(3), np.zeros(3), 1.0),)
+    charge: float = 1.0
+
+    @property
+    def up(self) -> Array:
+        """(copies,) the side of the mid-surface, as cross products of a copy see it, on which height is positive."""
+        return np.array([image.sign for image in self.images])
+
+    @property
+    def charges(self) -> Array:
+        """(copies,) factors of the charges."""
+        return np.where(self.up < 0, self.charge, 1.0)
+
+    def of(self, nodes: Array) -> Array:
+        """The nodes (copies cells, k, 3) of all."""
+        return np.concatenate([image.of(nodes) for image in self.images])
+
+
+ALL = Copies()  # of a shell that is modelled whole
 
 
 @dataclass(frozen=True)
@@ -70,11 +103,14 @@ class Stiffness:
     factor
         What they are multiplied by.
     row_of, column_of
-        (cells, k) numbers of nodes; rows of other ranks are -1.
+        (cells, k) numbers of nodes; rows of other ranks and of images are -1.
+    turn
+        (copies, 3, 3) what takes a change of the modelled nodes to that of the copy's.
     """
 
-    def __init__(self, rows: Array, factor: float, row_of: Ints, column_of: Ints) -> None:
+    def __init__(self, rows: Array, factor: float, row_of: Ints, column_of: Ints, turn: Array) -> None:
         self.rows, self.factor, self.row_of, self.column_of = rows, factor, row_of, column_of
+        self.turn = np.ascontiguousarray(turn)
         cells, k = row_of.shape
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
 
@@ -122,10 +158,11 @@ class Pairs:
         both, first, second = (_filled(each, idle) for each in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        into = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL]
+        into = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL, self._ffi.NULL, 1]
         if stiffness:
             onto, rows, width = stiffness.onto, stiffness.rows, stiffness.rows.shape[2]
-            into = [p(onto), p(rows), width, p(stiffness.row_of), p(stiffness.column_of)]
+            turn, modelled = stiffness.turn, len(nodes) // len(stiffness.turn)
+            into = [p(onto), p(rows), width, p(stiffness.row_of), p(stiffness.column_of), p(turn), modelled]
         one, other = ([p(each.tables), p(each.heights), p(each.t), p(each.q)] for each in (left[0], right[0]))
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
         factor = stiffness.factor if stiffness else 0.0
@@ -154,13 +191,24 @@ class Pairs:
         found = np.empty((len(own), len(nodes)), dtype=np.int8)
         given = [p(each) for each in (nodes, centre, normal, radius, apart)]
         failed = self._lib.rules(
-            len(nodes), own.start, own.stop, nodes.shape[1], *given, h, space, above, len(least), p(least), worst, p(found)
+            len(nodes),
+            own.start,
+            own.stop,
+            nodes.shape[1],
+            *given,
+            h,
+            space,
+            above,
+            len(least),
+            p(least),
+            worst,
+            p(found),
         )
         return None if failed else found
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype], array)
+        return self._ffi.from_buffer(KINDS[array.dtype.name], array)
 
 
 def _filled(each: Ints, idle: int) -> Ints:

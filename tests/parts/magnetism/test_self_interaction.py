@@ -6,6 +6,8 @@ from typing import Any
 import gmsh
 import numpy as np
 import pytest
+from command import magshell, read_path
+from interrupted import start, wait_for_rows
 from mpi4py import MPI
 from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
 from test_own_field import sphere_of_triangles
@@ -108,3 +110,113 @@ def test_inertia(model: Any, tmp_path: Path) -> None:
         counts.append(factors.negative_pivots)
         assert counts[-1] == np.sum(eigenvalues < 0)
     assert counts[0] == 0 < counts[1]
+
+
+def halves(file: Path, symmetry: str, polar: float, azimuth: float, **sections: Any) -> Scene:
+    """Two strips of 5 x 1 mm, one above the other, each of two halves with the same mesh; all of it, or a half."""
+    if not file.exists():
+        for z in (0.0, 0.5):
+            both = [gmsh.model.occ.addRectangle(0, y, z, 5.0, 0.5) for y in (-0.5, 0.0)]
+            gmsh.model.occ.fragment([(2, both[0])], [(2, both[1])])
+        gmsh.model.occ.synchronize()
+        for _, line in gmsh.model.getEntities(1):
+            x = gmsh.model.getBoundingBox(1, line)
+            gmsh.model.mesh.setTransfiniteCurve(line, 6 if x[3] - x[0] > 1 else 2)
+        for i, (_, face) in enumerate(gmsh.model.getEntities(2)):
+            gmsh.model.mesh.setTransfiniteSurface(face, "Left" if i % 2 else "Right")
+        for name, z in (("lower", 0.0), ("upper", 0.5)):
+            faces = gmsh.model.getEntitiesInBoundingBox(-1, -1, z - 0.1, 6, 1, z + 0.1, 2)
+            gmsh.model.addPhysicalGroup(2, [tag for _, tag in faces], name=name)
+            lines = gmsh.model.getEntitiesInBoundingBox(-0.1, -1, z - 0.1, 0.1, 1, z + 0.1, 1)
+            root = [tag for _, tag in lines]
+            rim = {tag for _, tag in gmsh.model.getBoundary(faces, oriented=False)}
+            gmsh.model.addPhysicalGroup(1, root, name=f"{name}_root")
+            gmsh.model.addPhysicalGroup(1, sorted(rim - set(root)), name=f"{name}_rim")
+        gmsh.model.mesh.generate(2)
+        gmsh.write(str(file))
+    magnetic = {"interaction": "all", "remanent": {"polar": polar, "azimuth": azimuth, "flux_density": f"{BR} T"}}
+    held = {"lower_root": "clamped", "upper_root": "clamped"}
+    sections = {"boundary": held, "magnetic": magnetic, "symmetry": symmetry, "mesh": {"degree": 2}} | sections
+    return Scene(case_of(file, 0.2, **sections))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("polar", "azimuth", "error"), [(40, 0, 5e-3), (90, 90, 1e-5)])  # mirrored, or opposite
+def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error: float) -> None:
+    """A half in its images' field is the half of the whole, to the error of rules: energy 1e-5, even and odd tangents.
+
+    Cells of the whole's other half begin at other corners than images do, which shows the error of rules for cells that
+    touch: largest in the tangent, of charged faces. Differences of the half's own energy and forces: 1e-6.
+    """
+    file, at = tmp_path / "halves.msh", {"interaction": 1.0}
+    whole, half = (halves(file, each, polar, azimuth) for each in ("none", "half"))
+    assert (whole.model.multiplicity, half.model.multiplicity) == (1, 2)
+    x, of = (each.model.r0.x.array.reshape(-1, 3) for each in (whole, half))
+    images = half.model.mirror.image(of)
+    here, there = (np.linalg.norm(x[:, None] - each, axis=-1).argmin(axis=0) for each in (of, images))
+    assert np.linalg.norm(x[here] - of, axis=-1).max() < 1e-9
+    S = half.model.mirror.reflection
+    bend = np.column_stack([0.01 * np.sin(2 * of[:, 1]) ** 2, 0 * of[:, 0], 0.03 * of[:, 0] ** 2 * (1 + of[:, 1] ** 2)])
+    u = np.zeros_like(x)
+    u[here], u[there] = bend, bend @ S
+    terms = [next(t for t in each.model.system.terms if t.name == "interaction") for each in (whole, half)]
+    states = [State(u.ravel(), at), State(bend.ravel(), at)]
+    systems = whole.model.system, half.model.system
+    energies = [s.at(state).of(t.energy) for s, state, t in zip(systems, states, terms, strict=True)]
+    assert 2 * energies[1] == pytest.approx(energies[0], rel=1e-5)
+    system, term, step = systems[1], terms[1], 3e-6
+    v, k = smooth(of, 1.0), rows_of(system, states[1], term)
+    assert np.abs(k - k.T).max() < 1e-11 * np.abs(k).max()
+    moved = [(w / step, bend + c * step * v) for c, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))]
+    change = sum(w * system.at(State(each.ravel(), at)).of(term.energy) for w, each in moved)
+    assert change == pytest.approx(gradient(half, bend.ravel()) @ v.ravel(), rel=1e-6)
+    slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
+    assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
+    K = rows_of(systems[0], states[0], terms[0])
+    for sign in (1.0, -1.0):
+        v, V = smooth(of, sign), np.zeros_like(x)
+        V[there], V[here] = sign * v @ S, v
+        k = rows_of(system, states[1], term if sign > 0 else term.antisymmetric())
+        assert 2 * v.ravel() @ k @ v.ravel() == pytest.approx(V.ravel() @ K @ V.ravel(), rel=error)
+
+
+CAP = """
+shell: {geometry: cap, radius: 25 mm, thickness: 1.2 mm, polar: 60, youngs_modulus: 0.3 MPa, poisson_ratio: 0.49}
+boundary: {rim: clamped}
+magnetic: {remanent: {polar: 0, flux_density: 150 mT}, interaction: all}
+loading: {kind: pressure, control: load, points: 2, pressure: 200 Pa, until: target}
+mesh: {degree: 2, size: 8 mm}
+symmetry: half
+"""
+
+
+@pytest.mark.slow
+def test_ranks_and_resume(tmp_path: Path) -> None:
+    """A half in its own and its image's field: the same path on 1, 2 and 3 ranks, and of a run that goes on."""
+    (tmp_path / "case.yaml").write_text(CAP)
+    run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
+    wait_for_rows(run, tmp_path / "again", 2)
+    run.terminate()
+    run.communicate()
+    done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again", "--resume", ranks=1)
+    assert done.returncode == 0, done.stderr
+    paths = [read_path(tmp_path / "again")]
+    for ranks in (1, 2, 3):
+        done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / str(ranks), ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        paths.append(read_path(tmp_path / str(ranks)))
+    for other in paths[1:]:
+        for name in ("interaction", "p_over_pc", "w_over_h", "energy", "magnetic"):
+            first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
+            assert values == pytest.approx(first, rel=1e-7, abs=1e-13), name
+
+
+def smooth(x: Array, sign: float) -> Array:
+    """A displacement that a mirror at y = 0 leaves, or turns into its opposite."""
+    even, odd = (np.cos(x[:, 1]), x[:, 1]) if sign > 0 else (x[:, 1], np.cos(x[:, 1]))
+    return np.column_stack([even * np.sin(3 * x[:, 0] + 1), odd * np.cos(2 * x[:, 0]), even * np.sin(2 * x[:, 0])])
+
+
+def rows_of(system: Any, state: State, term: Any) -> Array:
+    """The interaction's part of the tangent."""
+    return np.asarray(system.at(state).of(lambda: system._whole.rows([(1.0, term)])).reshape(system.size, -1))
