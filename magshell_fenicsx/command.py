@@ -6,11 +6,11 @@ Typer is imported without rich where no help is asked for: the import of rich ta
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from glob import escape, glob
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
@@ -42,10 +42,13 @@ class Command(typer.core.TyperCommand):
             each.show_default = each.default is not None and each.show_default  # type: ignore[attr-defined]
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
 class Commands(typer.Typer):
     """Commands of a program."""
 
-    def command[F: Callable[..., Any]](self, *args: Any, **kwargs: Any) -> Callable[[F], F]:
+    def command(self, *args: Any, **kwargs: Any) -> Callable[[Function], Function]:
         return super().command(*args, cls=Command, **kwargs)
 
 
