@@ -142,9 +142,7 @@ def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.Mo
     squares = np.array([bend(record) ** 2 for record in records[3:]])
     rises = np.diff(pressures[3:]) / pressures[1]  # along the branch: at its begin rounding hides 1e-5 of the pressure
     assert rises / np.diff(squares) == pytest.approx(27 / 32, rel=0.01)
-    begin = np.polyfit(squares, pressures[3:], len(squares) - 1)[
-        -1
-    ]  # of the branch
+    begin = np.polyfit(squares, pressures[3:], len(squares) - 1)[-1]  # of the branch
     assert abs(begin - pressures[1]) <= records[1].point.load_error < 1e-4 * begin
 
 
