@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import magshell
+from command import magshell, read_path
 from conftest import CASES
 
 import magshell_fenicsx as ms
@@ -76,6 +76,41 @@ def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
     assert places["turn"] == pytest.approx([2.0], rel=1e-3)
     assert places["meeting"] == pytest.approx(2 * [np.sqrt(5.5)], rel=1e-3)
     assert found.rows[-1]["unstable"] == 0
+
+
+@pytest.mark.slow
+def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
+    """The symmetric fold beyond the bifurcation, which the case alone does not start from, by its closed form."""
+    run, onward = tmp_path / "run", ["loading.1.until=points", "loading.1.points=40", f"{KEY}=2.6"]
+    words = [word for setting in onward for word in ("--set", setting)]
+    assert magshell("run", ARCH, *words, "--out", run, "--no-pictures").returncode == 0
+    located = {row["label"]: row["point"] for row in read_path(run) if row["label"] in ("fold", "bifurcation")}
+    over = ["boundary", ARCH, "--over", f"{KEY}=2.4:2.7:2", "--out", tmp_path / "b"]
+    done = magshell(*over, "--from", f"{run}:{located['fold']}")
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
+    assert (float(rows[0]["key"]), float(rows[-1]["key"])) == (2.4, 2.7)
+    for row in rows:
+        rise = float(row["key"])
+        assert row["kind"] == "fold"
+        assert float(row["load"]) == pytest.approx(2 * rise + 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3)
+    other = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", out=tmp_path / "c", start=f"{run}:{located['bifurcation']}")
+    alone = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", [f"{KEY}=2.6"], out=tmp_path / "d")
+    assert [row["load"] for row in other.rows] == pytest.approx([row["load"] for row in alone.rows], rel=1e-7)
+    for start, said in (
+        (f"{run}:0", f"is no fold or bifurcation of this run; these are {located['bifurcation']} (bifurcation), "),
+        (f"{run}", "write it as DIR:POINT"),
+        (f"{tmp_path}:1", "path.csv"),
+    ):
+        refused = magshell(*over, "--from", start)
+        assert refused.returncode == 2
+        assert said in refused.stderr
+    outside = magshell("boundary", ARCH, "--over", f"{KEY}=1:2", "--from", f"{run}:{located['fold']}")
+    assert outside.returncode == 2
+    assert "has 2.6, outside the range" in outside.stderr
+    both = magshell(*over, "--over", "foundation.stiffness=1e-9,1e-4", "--from", f"{run}:{located['fold']}")
+    assert both.returncode == 2
+    assert "a map starts at the end of each of its cases" in both.stderr
 
 
 class Killed(Exception):
