@@ -50,7 +50,8 @@ def test_against_runs_through_the_cusp(tmp_path: Path) -> None:
     found = ms.boundary(ARCH, f"{KEY}=0.7:1.6:12", out=tmp_path / "b")
     assert not found.stopped
     ordinary = [row for row in found.rows if row["kind"] == "fold"]
-    for row in ordinary[:: max(1, len(ordinary) // 4)]:
+    assert len(ordinary) >= 12
+    for row in ordinary[:: len(ordinary) // 12]:
         of_runs = folds(f"{KEY}={row['key']!r}")
         assert min(abs(load - row["load"]) for load in of_runs) < 1e-7 * abs(row["load"])
     work = found.content["factorisations"]
@@ -65,6 +66,27 @@ def test_a_number_of_the_shape(tmp_path: Path) -> None:
     found = ms.boundary(ARCH, f"{key}=0.75:0.85:2", [*fixed, f"{key}=0.8"], tmp_path / "b")
     for row in (found.rows[0], found.rows[-1]):
         assert min(abs(load - row["load"]) for load in folds(*fixed, f"{key}={row['key']!r}")) < 1e-7 * row["load"]
+
+
+@pytest.mark.slow
+def test_a_caps_fold_vanishes_with_the_order_three_halves(tmp_path: Path) -> None:
+    """Over its depth: the cusp is the same from two starts to 1e-6, and beyond it both loads differ by c d^(3/2)."""
+    case = tmp_path / "cap.yaml"
+    case.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 12, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "symmetry: axisymmetric\nloading: {kind: pressure, until: limit}\n"
+    )
+    cusps, depths, gaps = list[float](), (10.533, 10.548), list[float]()
+    for i, depth in enumerate(depths):
+        found = ms.boundary(case, f"shell.polar=10.4:{depth}:3", out=tmp_path / f"{i}")
+        (cusp,) = found.special
+        assert cusp["kind"] == "cusp"
+        assert found.rows[0]["key"] == found.rows[-1]["key"] == depth
+        cusps.append(cusp["key"])
+        gaps.append(abs(found.rows[0]["load"] - found.rows[-1]["load"]))
+    assert cusps[0] == pytest.approx(cusps[1], rel=1e-6)
+    order = np.log(gaps[1] / gaps[0]) / np.log((depths[1] - cusps[0]) / (depths[0] - cusps[0]))
+    assert order == pytest.approx(1.5, abs=0.005)
 
 
 @pytest.mark.slow
