@@ -174,6 +174,12 @@ def boundary(
             help="the key that varies, and its range; A:B:STEPS is finer; a second one, KEY=A:B:COUNT, makes a map",
         ),
     ],
+    from_: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="DIR:POINT", help="start at another fold or bifurcation: a point of the path.csv of a run"
+        ),
+    ] = None,
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_boundary/")] = None,
 ) -> None:
@@ -186,9 +192,9 @@ def boundary(
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
         if len(over) == 1:
-            done = follow_boundary(case, over[0], set_ or [], folder, made=_made)
+            done = follow_boundary(case, over[0], set_ or [], folder, made=_made, start=from_)
         else:
-            done = boundary_map(case, over, set_ or [], folder, made=_made)
+            done = boundary_map(case, over, set_ or [], folder, made=_made, start=from_)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)

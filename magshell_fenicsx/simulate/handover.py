@@ -97,9 +97,9 @@ def departed(stage: Stage, found: Record, scale: float) -> Departure:
             phi = critical_mode(stage.newton, state).vector
         except NoEigenpair as e:
             raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
-        return Departure(
-            stage, path, _at(path, state, phi, found.point.negative_pivots), unstable=found.excluded_pivots
-        )
+        there = found.point
+        point = _at(path, state, phi, there.negative_pivots, there.error, there.load_error)
+        return Departure(stage, path, point, unstable=found.excluded_pivots)
     new = larger(stage.scene, found.mode)
     other = stage.on(new)
     try:

@@ -39,6 +39,7 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
+from magshell_fenicsx.studies.boundary_start import Start, start_from
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
 
@@ -146,6 +147,7 @@ def boundary(
     say: Say = print_line,
     *,
     made: Made,
+    start: str | None = None,
 ) -> StabilityBoundary:
     """Follow the instability at the end of a case in a second key; collective, two ranks work.
 
@@ -160,6 +162,8 @@ def boundary(
         Folder of boundary.csv, boundary.json, boundary.png and points/.
     made
         Makes a case of its source.
+    start
+        Another instability: "DIR:POINT", a located point of the run in a folder, whose case takes the place of `file`.
 
     Raises
     ------
@@ -173,17 +177,21 @@ def boundary(
     """
     span = parse_range(over)
     source = from_first(comm, lambda: read_source(Path(file), settings))
+    begun_at, source = from_first(comm, lambda: start_from(start, source))
+    for setting in settings if start else ():
+        override(source, setting)
     folder, name = given_folder(out), Path(file).name
     once: Say = say if comm.rank == 0 else lambda line: None
     with FOLDER.held(folder, comm, name), heard(comm, once) as once:
         say = once if comm.rank == 0 else say
-        journal = partial(_Journal, folder / "points", _identity(source, span, made))
-        value = _value(source, span, made)
-        begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say))
+        journal = partial(_Journal, folder / "points", _identity(source, span, made, begun_at.text))
+        value = _value(source, span, made, outside=not start)
+        begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
         if begin["mode"] == "antisymmetric":
             once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
-            begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say))
+            again = begun_at.anywhere()
+            begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
         if not begin["label"]:
             instability([])
         refuse_excluded(begin["mode"])
@@ -206,17 +214,20 @@ def boundary(
     return done
 
 
-def _value(source: Source, span: Range, made: Made) -> float:
-    """Where the boundary starts: the case's own value, or the end of the range that is nearest to it."""
+def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
+    """Where the boundary starts: the case's own value, or where that may be outside, the end that is nearest to it."""
     words = span.key.split(".")
     raw = value_at(source.data, words)
     raw = value_at(made(source).model_dump(mode="json"), words) if raw is None else raw
     try:
-        return float(np.clip(in_unit(str(raw), span.unit), *span.ends))
+        value = in_unit(str(raw), span.unit)
     except ValueError:
         if isinstance(raw, dict | list | bool):
             raise CaseError(f"--over {span.key}: is no number in the case, but {type(raw).__name__}") from None
-        return span.first
+        value = span.first
+    if not outside and not span.ends[0] <= value <= span.ends[1]:
+        raise CaseError(f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the range")
+    return float(np.clip(value, *span.ends))
 
 
 def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
@@ -237,10 +248,10 @@ def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
     return with_modes(problem, MPI.COMM_SELF) if problem.awaited else problem
 
 
-def _identity(source: Source, span: Range, made: Made) -> str:
-    """Hash of the case and the range."""
+def _identity(source: Source, span: Range, made: Made, start: str) -> str:
+    """Hash of the case, the range and the start."""
     case = made(source)
-    data = [case.model_dump(mode="json") | case.outside, asdict(span)]
+    data = [case.model_dump(mode="json") | case.outside, asdict(span), *([start] if start else [])]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -299,7 +310,9 @@ def _locus(data: dict[str, Any]) -> Locus:
     return Locus(**{**data, "state": state, "way": way, "phi": _vector(data["phi"])})
 
 
-def _begin(source: Source, span: Range, value: float, made: Made, journal: _Journal, say: Say) -> dict[str, Any]:
+def _begin(
+    source: Source, span: Range, value: float, made: Made, journal: _Journal, say: Say, start: Start
+) -> dict[str, Any]:
     """The run to the instability, as data; without a label there is none."""
     for end in span.ends:
         _problem(source, span, made, end)
@@ -308,14 +321,19 @@ def _begin(source: Source, span: Range, value: float, made: Made, journal: _Jour
     scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
     records, lost = list[Record](), None
     try:
-        records.extend(follow_alone(scene, remark=say))
+        for record in follow_alone(scene, remark=say):
+            records.append(record)
+            if start.complete(records):
+                break
     except Stopped as e:  # what lies beyond an instability does not matter
         lost = e
     try:
-        found = instability(records)
+        found = start.of(records)
     except CaseError:
         if lost:
             raise lost from None
+        if start.text:
+            raise
         return {"label": "", "mode": ""}
     state = found.point.state
     outcome = {

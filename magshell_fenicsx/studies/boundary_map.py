@@ -53,6 +53,7 @@ def boundary_map(
     say: Say = print_line,
     *,
     made: Made,
+    start: str | None = None,
 ) -> StabilityBoundary:
     """Follow the instability of a case in one key, for each value of a second one; collective.
 
@@ -73,6 +74,8 @@ def boundary_map(
     CaseError
         See `boundary`; or if there is an instability at no value of the second key.
     """
+    if start:
+        raise CaseError(f"--from {start}: a map starts at the end of each of its cases: give one --over")
     if len(overs) != 2:
         raise CaseError(f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two")
     span = parse_range(overs[0])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import magshell
+from command import magshell, read_path
 from conftest import CASES
 
 import magshell_fenicsx as ms
@@ -52,7 +52,8 @@ def test_against_runs_through_the_cusp(tmp_path: Path) -> None:
     found = ms.boundary(ARCH, f"{KEY}=0.7:1.6:12", out=tmp_path / "b")
     assert not found.stopped
     ordinary = [row for row in found.rows if row["kind"] == "fold"]
-    for row in ordinary[:: max(1, len(ordinary) // 4)]:
+    assert len(ordinary) >= 12
+    for row in ordinary[:: len(ordinary) // 12]:
         of_runs = folds(f"{KEY}={row['key']!r}")
         assert min(abs(load - row["load"]) for load in of_runs) < 1e-7 * abs(row["load"])
     work = found.content["factorisations"]
@@ -70,6 +71,27 @@ def test_a_number_of_the_shape(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_caps_fold_vanishes_with_the_order_three_halves(tmp_path: Path) -> None:
+    """Over its depth: the cusp is the same from two starts to 1e-6, and beyond it both loads differ by c d^(3/2)."""
+    case = tmp_path / "cap.yaml"
+    case.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 12, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "symmetry: axisymmetric\nloading: {kind: pressure, until: limit}\n"
+    )
+    cusps, depths, gaps = list[float](), (10.533, 10.548), list[float]()
+    for i, depth in enumerate(depths):
+        found = ms.boundary(case, f"shell.polar=10.4:{depth}:3", out=tmp_path / f"{i}")
+        (cusp,) = found.special
+        assert cusp["kind"] == "cusp"
+        assert found.rows[0]["key"] == found.rows[-1]["key"] == depth
+        cusps.append(cusp["key"])
+        gaps.append(abs(found.rows[0]["load"] - found.rows[-1]["load"]))
+    assert cusps[0] == pytest.approx(cusps[1], rel=1e-6)
+    order = np.log(gaps[1] / gaps[0]) / np.log((depths[1] - cusps[0]) / (depths[0] - cusps[0]))
+    assert order == pytest.approx(1.5, abs=0.005)
+
+
+@pytest.mark.slow
 def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
     """Before the fold from sqrt(5.5) on; that boundary turns at 2, both in the limit of shallow arches."""
     found = ms.boundary(ARCH, f"{KEY}=1.8:2.7:8", [f"{KEY}=2.6"], tmp_path / "b")
@@ -78,6 +100,41 @@ def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
     assert places["turn"] == pytest.approx([2.0], rel=1e-3)
     assert places["meeting"] == pytest.approx(2 * [np.sqrt(5.5)], rel=1e-3)
     assert found.rows[-1]["unstable"] == 0
+
+
+@pytest.mark.slow
+def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
+    """The symmetric fold beyond the bifurcation, which the case alone does not start from, by its closed form."""
+    run, onward = tmp_path / "run", ["loading.1.until=points", "loading.1.points=40", f"{KEY}=2.6"]
+    words = [word for setting in onward for word in ("--set", setting)]
+    assert magshell("run", ARCH, *words, "--out", run, "--no-pictures").returncode == 0
+    located = {row["label"]: row["point"] for row in read_path(run) if row["label"] in ("fold", "bifurcation")}
+    over = ["boundary", ARCH, "--over", f"{KEY}=2.4:2.7:2", "--out", tmp_path / "b"]
+    done = magshell(*over, "--from", f"{run}:{located['fold']}")
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
+    assert (float(rows[0]["key"]), float(rows[-1]["key"])) == (2.4, 2.7)
+    for row in rows:
+        rise = float(row["key"])
+        assert row["kind"] == "fold"
+        assert float(row["load"]) == pytest.approx(2 * rise + 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3)
+    other = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", out=tmp_path / "c", start=f"{run}:{located['bifurcation']}")
+    alone = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", [f"{KEY}=2.6"], out=tmp_path / "d")
+    assert [row["load"] for row in other.rows] == pytest.approx([row["load"] for row in alone.rows], rel=1e-7)
+    for start, said in (
+        (f"{run}:0", f"is no fold or bifurcation of this run; these are {located['bifurcation']} (bifurcation), "),
+        (f"{run}", "write it as DIR:POINT"),
+        (f"{tmp_path}:1", "path.csv"),
+    ):
+        refused = magshell(*over, "--from", start)
+        assert refused.returncode == 2
+        assert said in refused.stderr
+    outside = magshell("boundary", ARCH, "--over", f"{KEY}=1:2", "--from", f"{run}:{located['fold']}")
+    assert outside.returncode == 2
+    assert "has 2.6, outside the range" in outside.stderr
+    both = magshell(*over, "--over", "foundation.stiffness=1e-9,1e-4", "--from", f"{run}:{located['fold']}")
+    assert both.returncode == 2
+    assert "a map starts at the end of each of its cases" in both.stderr
 
 
 class Killed(Exception):

@@ -216,6 +216,23 @@ def test_bands_of_200_repeats_and_metropolis(tmp_path: Path) -> None:
     assert np.std(samples, axis=0) == pytest.approx(fit.deviation, rel=0.05)
 
 
+@pytest.mark.slow
+def test_the_posterior_of_emcee(tmp_path: Path) -> None:
+    """Means and standard deviations within 5 %, where emcee (Foreman-Mackey and others 2013) is installed."""
+    emcee = pytest.importorskip("emcee")
+    model, rng = Interpolated(tmp_path), np.random.default_rng(3)
+    data, group = model(TRUTH)[0] + NOISE * rng.normal(size=2 * len(FIELDS)), np.tile([0, 1], len(FIELDS))
+    known = Measured(data, group, np.full(2, NOISE), TRUTH, np.full(2, np.inf))
+    fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
+    logarithm = lambda x: -float(np.sum(((data - model(x)[0]) / NOISE) ** 2)) / 2  # noqa: E731
+    np.random.seed(5)  # noqa: NPY002  emcee's own generator
+    sampler = emcee.EnsembleSampler(16, 2, logarithm)
+    sampler.run_mcmc(fit.x + fit.deviation * rng.normal(size=(16, 2)), 3000)
+    samples = sampler.get_chain(discard=200, flat=True)
+    assert (np.abs(samples.mean(axis=0) - fit.x) < 0.05 * fit.deviation).all()
+    assert samples.std(axis=0) == pytest.approx(fit.deviation, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("data", "settings", "said"),
     [

@@ -1,0 +1,96 @@
+"""Where a boundary starts: at the end of its case, or at a located point of another run of it."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import isclose
+from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.known import case_in
+from magshell_fenicsx.output.store.table import LOCATED, read_rows
+from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.varied import NoInstability, instability
+
+SAME = 1e-3  # of a load: the run and its repetition, on another processor
+FORM = "write it as DIR:POINT, with the folder of a run and the number of a fold or bifurcation in its path.csv"
+
+
+@dataclass(frozen=True)
+class Start:
+    """Which instability of a history is followed.
+
+    Attributes
+    ----------
+    text
+        As it is given; "" for the first one in the last step.
+    point
+        Its number in the history; -1 without one.
+    load
+        There.
+    """
+
+    text: str = ""
+    point: int = -1
+    load: float = 0.0
+
+    def complete(self, records: Sequence[Record]) -> bool:
+        """Whether no further records are needed."""
+        return 0 <= self.point < len(records)
+
+    def of(self, records: Sequence[Record]) -> Record:
+        """The instability of a history.
+
+        Raises
+        ------
+        NoInstability
+            If it is not there.
+        """
+        if not self.text:
+            return instability(records)
+        near = [r for r in records if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=SAME)]
+        if self.complete(records) and records[self.point] in near:
+            return records[self.point]
+        if not near:
+            raise NoInstability(f"--from {self.text}: the run, repeated, has no such point")
+        return min(near, key=lambda r: abs(_load(r) - self.load))
+
+    def anywhere(self) -> "Start":
+        """The same instability in a history of other points, as that of the whole shell is."""
+        return replace(self, point=-1)
+
+
+def _load(record: Record) -> float:
+    return float(record.point.state.mu.get(record.amplitude, 0.0))
+
+
+def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
+    """Read `--from`: which instability is meant, and the case of that run in place of a case.
+
+    Raises
+    ------
+    CaseError
+        If it has another form, or there is no such point.
+    """
+    if not text:
+        return Start(), source
+    parts = re.fullmatch(r"(.+):(\d+)", text)
+    if not parts:
+        raise CaseError(f"--from {text}: {FORM}")
+    folder, point = Path(parts[1]), int(parts[2])
+    try:
+        data, rows = case_in(folder), read_rows(folder / "path.csv")
+    except (Damaged, OSError) as e:
+        raise CaseError(f"--from {text}: {e}") from None
+    if not data:
+        raise CaseError(f"--from {text}: {folder} has no run")
+    located: dict[Any, Any] = {row["point"]: row for row in rows if row["label"] in LOCATED}
+    if point not in located:
+        there = ", ".join(f"{number} ({row['label']})" for number, row in located.items()) or "none"
+        raise CaseError(f"--from {text}: is no fold or bifurcation of this run; these are {there}")
+    row = located[point]
+    load = float(row[amplitude(row["amplitude"]).column])
+    return Start(text, point, load), replace(source, data=data, places={})
