@@ -1,3 +1,7 @@
-from magshell_fenicsx.cli import main
+import gc
 
+gc.disable()  # what is imported stays
+from magshell_fenicsx.cli import main  # noqa: E402
+
+gc.enable()
 main()

@@ -64,7 +64,7 @@ def main() -> None:
     """Run the program."""
     open_standard_streams()
     _hand_over_to_petsc(sys.argv)
-    gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
+    gc.set_threshold(300_000, 5, 5)  # a small run looks for no garbage; Python's own would do so two hundred times
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
