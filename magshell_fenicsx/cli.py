@@ -116,6 +116,7 @@ def run(
     from magshell_fenicsx.public import run as run_case
     from magshell_fenicsx.runs.files import AlreadyComplete
 
+    gc.freeze()  # what is imported stays
     try:
         with exit_codes(stopped=(DiskError,)), live_line(world().size, print_line) as (say, tell):
             result = run_case(read, folder, say=say, tell=tell, **how)
