@@ -1,3 +1,8 @@
-from magshell_fenicsx.cli import main
+import gc
 
+gc.disable()  # what is imported stays
+from magshell_fenicsx.cli import main  # noqa: E402
+
+gc.freeze()
+gc.enable()
 main()

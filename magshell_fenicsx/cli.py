@@ -65,7 +65,7 @@ def main() -> None:
     """Run the program."""
     open_standard_streams()
     _hand_over_to_petsc(sys.argv)
-    gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
+    gc.set_threshold(300_000, 5, 5)  # a small run looks for no garbage; Python's own would do so two hundred times
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
@@ -117,6 +117,7 @@ def run(
     from magshell_fenicsx.public import run as run_case
     from magshell_fenicsx.runs.files import AlreadyComplete
 
+    gc.freeze()  # what is imported stays
     try:
         with exit_codes(stopped=(DiskError,)), live_line(world().size, print_line) as (say, tell):
             result = run_case(read, folder, say=say, tell=tell, **how)

@@ -1,7 +1,7 @@
 """Direct factorisation of the tangent, of one with an edge, and of small matrices; inertia, condition and the work."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from types import TracebackType
 
 import numpy as np
@@ -334,28 +334,30 @@ class Banded:
     Parameters
     ----------
     rows, columns
-        Of each entry of the pattern.
+        Of each entry of the pattern; one triangle is enough.
     held
         Rows and columns that are replaced by those of the unit matrix.
     """
 
     def __init__(self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]) -> None:
         n = int(rows.max()) + 1
-        pattern = coo_array((np.ones(len(rows)), (rows, columns)), (n, n)).tocsr()
+        both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+        pattern = coo_array((np.ones(2 * len(rows)), both), (n, n)).tocsr()
         order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
         place = np.empty(n, dtype=np.int64)
         place[order] = np.arange(n)
-        i, j = place[rows], place[columns]
         free = np.ones(n, dtype=bool)
         free[held] = False
-        self._kept = np.flatnonzero((i >= j) & free[rows] & free[columns])
-        i, j = i[self._kept], j[self._kept]
+        self._kept = np.flatnonzero(free[rows] & free[columns])
+        rows, columns = rows[self._kept], columns[self._kept]
+        i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
         self._shape = (int((i - j).max(initial=0)) + 1, n)
         self._at = (i - j) + j * self._shape[0]  # in LAPACK's lower band, column by column
         self._ones = place[held]
 
-    def bands(self, values: Sequence[Array]) -> Array:
+    def bands(self, values: Iterable[Array]) -> Array:
         """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what is held."""
+        values = list(values)
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
         for band, v in zip(stacked, values, strict=True):
             band[self._at] = v.ravel()[self._kept]

@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import nan, pi, sqrt
 from typing import Literal
 
@@ -279,7 +280,7 @@ class Quantity:
         shown = Unit(unit.shown, unit.shown)
         return replace(self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,))
 
-    @property
+    @cached_property
     def in_units(self) -> tuple["Quantity", ...]:
         """The same in the units of a case, one of which is a column of its own where the case has units.
 

@@ -82,7 +82,7 @@ class Waves:
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
-        entries = self._system.at(state).assembled(lambda: self._entries(state, m))
+        (entries,) = self._system.at(state).assembled(lambda: self._entries(state, [m]))
         return self._filled("tangent", entries.ravel(), m)
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
@@ -112,8 +112,8 @@ class Waves:
         between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
         assembled. Only those that are not positive definite are factored for their inertia.
         """
-        values = self._system.at(state).assembled(lambda: [self._entries(state, m) for m in self._nodes[:3]])
-        values += [_mirrored(v) for v in values[1:]]
+        of_nodes = self._system.at(state).assembled(lambda: self._entries(state, self._nodes[:3]))
+        values = np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
         if not self._bands:
             self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
         found = [0] * self.largest
@@ -121,57 +121,66 @@ class Waves:
             found[m - 1] = self._interpolated_pivots(m, values)
         return found
 
-    def _entries(self, state: State, m: float) -> NDArray[np.float64]:
-        """The entries (pairs of nodes, 3, 3) of Q_m's matrix, with nothing held, at the displacement of the system."""
+    def _entries(self, state: State, waves: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the system's displacement."""
         factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._kept}
-        return self._points.entries(factors, m)
+        return self._points.entries(factors, [float(m) for m in waves])
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of these entries."""
+        """Rows and columns of these entries: those of one triangle, and all of the nodes' own blocks."""
         rows, columns = (
             3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64) for a in (self._points.rows, self._points.columns)
         )
         return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
 
-    def _indefinite(self, values: Sequence[NDArray[np.float64]]) -> list[int]:
-        """The waves whose matrices are not positive definite.
+    @cached_property
+    def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+        """The whole matrix in compressed rows: where they start, columns, and which of these entries stands there."""
+        rows, columns = self._sparsity
+        below = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
+        both = np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]])
+        K = coo_array((np.concatenate([np.arange(len(rows)), below]), both)).tocsr()
+        return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
+
+    def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
+        """The waves whose matrices are not positive definite, from the entries (nodes, entries) at the nodes.
 
         On a piece of the axis of m the matrix is a mean of its five Bernstein coefficients with weights that are not
         negative: if these are positive definite, it is so for every m of the piece. Else the piece is halved, for the
         next states too, until its waves are as few as coefficients.
         """
-        first, rest = (known.bands(values) for known in self._bands)
-        definite = cache(lambda m: self._bands[1].positive(rest, self._weights[m]))
-        indefinite = set[int]() if self._bands[0].positive(first, self._weights[1]) else {1}
+        once, twice = self._bands
+        first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
+        definite = cache(lambda m: twice.positive(rest, self._weights[m]))
+        indefinite = set[int]() if once.positive(first, np.ones(1)) else {1}
         halved, self._pieces = self._pieces, []
         while halved:
             piece = halved.pop()
             ends = definite(piece.first) and definite(piece.last)
             if piece.short:
                 indefinite |= {m for m in range(piece.first, piece.last + 1) if not definite(m)}
-            elif not (ends and all(self._bands[1].positive(rest, weights) for weights in piece.inner)):
+            elif not (ends and all(twice.positive(rest, weights) for weights in piece.inner)):
                 halved += piece.halves(self._nodes)
                 continue
             self._pieces.append(piece)
         return sorted(indefinite)
 
-    def _interpolated_pivots(self, m: int, values: Sequence[NDArray[np.float64]]) -> int:
-        entries = self._weights[m] @ np.reshape(values, (len(values), -1))
-        self._counting.factor(self._filled("interpolated", entries, m))
+    def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
+        self._counting.factor(self._filled("interpolated", self._weights[m] @ values, m))
         return self._counting.negative_pivots
 
     def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
         """A matrix with these entries, in the order of `_sparsity`, with what is held; the next call overwrites it."""
-        K = coo_array((entries, self._sparsity)).tocsr()
-        first, columns = (a.astype(PETSc.IntType) for a in (K.indptr, K.indices))
+        first, columns, places = self._rows_of_matrix
+        data = entries[places]
         if name not in self._matrices:
-            made = PETSc.Mat().createAIJ(K.shape, csr=(first, columns, K.data), comm=self.V.mesh.comm)
+            made = PETSc.Mat().createAIJ((len(first) - 1,) * 2, csr=(first, columns, data), comm=self.V.mesh.comm)
             made.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             made.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
             self._matrices[name] = made
         filled = self._matrices[name]
-        filled.setValuesCSR(first, columns, K.data)
+        filled.setValuesCSR(first, columns, data)
         filled.assemble()
         filled.zeroRowsColumns(self._rows(m), 1.0)
         return filled
@@ -211,7 +220,7 @@ class _Piece:
         self.inner = np.linalg.solve(np.stack(bernstein, axis=1), values)[1:-1]
 
     def halves(self, nodes: NDArray[np.float64]) -> list["_Piece"]:
-        middle = (self.first + self.last) // 2
+        middle = round(sqrt(self.first * self.last))  # the matrices vary most at small m
         return [_Piece(self.first, middle, nodes), _Piece(middle, self.last, nodes)]
 
 
@@ -223,10 +232,10 @@ def _lagrange(nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.i
 
 
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The entries of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P - 2 V."""
+    """The entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P - 2 V."""
     found = entries.copy()
-    found[:, :, 1] = -2 * found[:, :, 0] - found[:, :, 1]
-    found[:, 1] = -2 * found[:, 0] - found[:, 1]
+    found[..., 1] = -2 * found[..., 0] - found[..., 1]
+    found[..., 1, :] = -2 * found[..., 0, :] - found[..., 1, :]
     return found
 
 

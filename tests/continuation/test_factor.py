@@ -159,15 +159,16 @@ def failing(monkeypatch: pytest.MonkeyPatch, number: int) -> Factorisation:
     return Factorisation(MPI.COMM_SELF)
 
 
+@pytest.mark.parametrize("triangle", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_definite_or_not(seed: int) -> None:
-    """Two matrices of one sparsity, interpolated so that the least eigenvalue crosses zero."""
+def test_definite_or_not(seed: int, triangle: bool) -> None:
+    """Two matrices of one sparsity, or their triangles, interpolated so that the least eigenvalue crosses zero."""
     random, n = np.random.default_rng(seed), 30
     order = random.permutation(n)  # of a band that the numbering hides
     near = np.abs(order[:, None] - order) <= 3
     A, B = (np.where(near, x + x.T, 0.0) for x in random.standard_normal((2, n, n)))
     A += 100 * np.eye(n)  # definite, and so is A + t (B - A) for small t alone
-    rows, columns = np.nonzero(near)
+    rows, columns = np.nonzero(np.triu(near) if triangle else near)
     held = np.array([0, 7], dtype=np.int32)
     banded = Banded(rows, columns, held)
     bands = banded.bands([A[rows, columns], B[rows, columns]])

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from itertools import combinations_with_replacement
 
 import basix
 import numpy as np
@@ -9,9 +10,11 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.batches import Batch, Rule
+from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, whole_hessian
 from magshell_fenicsx.models.carriers import Carrier, Energy, revolved_by, wave_by
@@ -24,6 +27,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 DERIVATIVES = 3  # value, first and second derivative along the meridian
 PLANE, WAVE = 2, 3  # components of axisymmetric fields and of a wave's coefficients
+_UPPER = tuple(combinations_with_replacement(range(WAVE), 2))  # pairs of components; the others follow by symmetry
 
 
 class WavePoints:
@@ -39,7 +43,7 @@ class WavePoints:
     Attributes
     ----------
     rows, columns
-        (pairs,) of the nodes of the entries, sorted by rows.
+        (pairs,) of the nodes of the entries, sorted by rows, rows <= columns: the matrices are symmetric.
     """
 
     def __init__(self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog) -> None:
@@ -52,21 +56,25 @@ class WavePoints:
             for there in places.values()
             for batch in _batches(carrier, there[0].density)
         ]
-        pairs = [site.pairs(self._nodes) for site in self._sites]
+        nodes = [site.nodes(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
-        numbers, of_pairs = np.unique(np.concatenate([each.ravel() for each in pairs]), return_inverse=True)
+        pairs = [rows * count + columns for rows, columns in nodes]
+        kept = [number[rows <= columns] for number, (rows, columns) in zip(pairs, nodes, strict=True)]
+        numbers = np.unique(np.concatenate(kept))
         self.rows, self.columns = numbers // count, numbers % count
-        within = 9 * of_pairs[:, None] + np.arange(9)  # of the components of a block
-        ends = np.cumsum([each.size for each in pairs])[:-1]
-        self._places = [part.ravel() for part in np.split(within, ends)]
+        self._sums = [
+            _sum_of_blocks(np.searchsorted(numbers, number), rows <= columns, len(numbers))
+            for number, (rows, columns) in zip(pairs, nodes, strict=True)
+        ]
 
-    def entries(self, factors: Mapping[str | None, float], m: float) -> Array:
-        """(pairs, 3, 3) at the present u; `factors` by amplitude."""
-        total = np.zeros(9 * len(self.rows))
-        for site, places in zip(self._sites, self._places, strict=True):
-            if (blocks := site.blocks(factors, m)) is not None:
-                total += np.bincount(places, blocks.ravel(), len(total))
-        return total.reshape(-1, 3, 3)
+    def entries(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array:
+        """(waves, pairs, 3, 3) at the present u; `factors` by amplitude."""
+        total = np.zeros((len(waves), 9 * len(self.rows)))
+        for site, sums in zip(self._sites, self._sums, strict=True):
+            if (blocks := site.blocks(factors, waves)) is not None:
+                for entries, of_wave in zip(total, blocks, strict=True):
+                    entries += sums @ of_wave.ravel()
+        return total.reshape(len(waves), -1, 3, 3)
 
 
 class _Site:
@@ -82,40 +90,47 @@ class _Site:
         self._at_u, self._at_r0, self._drawn = (points.field(PLANE * DERIVATIVES * sides) for _ in range(3))
         self._wave, self._geometry = points.field(WAVE * DERIVATIVES * sides), points.field(2 * sides)
         fill(self._geometry, batch.geometry)
+        fixed = [carrier.r0] if carrier.drawn is None else [carrier.r0, carrier.drawn]
+        self._placed = Follows(self._place, lambda: tuple(field.x.array for field in fixed))
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [parameters_at(points, e.density.parameters, sides) for e in energies if e.density]
         self._varying = [
             [(here, on_batches(field, [batch], sides)) for here, field in varying] for _, varying in self._given
         ]
 
-    def pairs(self, nodes: Ints) -> Ints:
-        """(entities, functions, functions) numbers of the pairs of nodes that an entity couples."""
-        count = int(nodes.max()) + 1
+    def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
+        """(entities, functions, functions) the nodes of the rows and of the columns of what an entity couples."""
         here = np.hstack([nodes[cells] for cells in self._batch.cells])
-        return np.asarray(here[:, :, None] * count + here[:, None])
+        both = np.broadcast_arrays(here[:, :, None], here[:, None])
+        return both[0], both[1]
 
-    def blocks(self, factors: Mapping[str | None, float], m: float) -> Array | None:
-        """(entities, functions, functions, 3, 3); None if no energy is there."""
+    def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
+        """(waves, entities, pairs of components, pairs of functions), see `_UPPER`; None if no energy is there."""
         present = [number for number, e in enumerate(self._energies) if factors[e.amplitude]]
         if not present:
             return None
-        self._m.value = m
         fill(self._at_u, self._derivatives(self._u))
-        fill(self._at_r0, self._derivatives(self._carrier.r0))
-        if self._carrier.drawn is not None:
-            fill(self._drawn, self._derivatives(self._carrier.drawn))
-        size = WAVE * DERIVATIVES * len(self._sides)
-        upper = np.zeros((self._batch.size, size * (size + 1) // 2))
+        self._placed.renew()
         for number in present:
             for here, values in self._varying[number]:
                 fill(here, values.renew()[0])
-            factor = np.pi * factors[self._energies[number].amplitude]
-            upper += factor * self._points.evaluate(self._kernels[number], self._batch.size)
-        entities, functions = len(self._batch.cells[0]), len(self._sides) * self._reference[0].shape[2]
-        ordered = (upper * self._scales).reshape(entities, -1)[:, self._order]
-        whole = ordered.reshape(-1, len(self._products)) @ self._products
-        whole = whole.reshape(entities, WAVE, WAVE, functions, functions)
-        return np.asarray(whole.transpose(0, 3, 4, 1, 2))
+        upper = np.zeros((len(waves), *self._scales.shape))
+        for which, m in enumerate(waves):
+            self._m.value = m
+            for number in present:
+                factor = np.pi * factors[self._energies[number].amplitude]
+                upper[which] += factor * self._points.evaluate(self._kernels[number], self._batch.size)
+        upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
+        some = upper.any(axis=(0, 2))  # a body touches few cells
+        whole = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
+        ordered = upper[:, some][..., self._order].reshape(-1, len(self._products))  # one large product
+        whole[:, some] = (ordered @ self._products).reshape(len(waves), -1, *whole.shape[2:])
+        return whole
+
+    def _place(self) -> None:
+        fill(self._at_r0, self._derivatives(self._carrier.r0))
+        if self._carrier.drawn is not None:
+            fill(self._drawn, self._derivatives(self._carrier.drawn))
 
     @cached_property
     def _kernels(self) -> list[PointKernel]:
@@ -189,12 +204,14 @@ class _Site:
 
     @cached_property
     def _order(self) -> Ints:
-        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of its Hessians."""
+        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of its Hessians.
+
+        These pairs are those of `_UPPER`.
+        """
         derivatives = DERIVATIVES * len(self._sides)
         triangle = _triangle(WAVE * derivatives).reshape(derivatives, WAVE, derivatives, WAVE)
         points = np.arange(len(self._batch.rule.weights)) * (triangle.max() + 1)
-        places = triangle.transpose(1, 3, 0, 2)[:, :, None] + points[:, None, None]
-        return np.asarray(places.reshape(WAVE**2, -1))
+        return np.stack([(triangle[:, c, :, d] + points[:, None, None]).ravel() for c, d in _UPPER])
 
     @cached_property
     def _scales(self) -> Array:
@@ -222,6 +239,28 @@ def _added(
         return density.at([r0, more], edge, parameters)
     less = [a - b for a, b in zip(u, v, strict=True)]
     return (density.at([r0, more, v], edge, parameters) - density.at([r0, less, v], edge, parameters)) / 4
+
+
+def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_array:
+    """The matrix (entries of all pairs of nodes, entries of a site's blocks) that sums these.
+
+    Parameters
+    ----------
+    numbers
+        (entities, functions, functions) of the pairs of nodes, where these are `kept`.
+    count
+        Of all pairs.
+    """
+    entries = np.arange(numbers.size * len(_UPPER)).reshape(len(numbers), len(_UPPER), *numbers.shape[1:])
+    rows, columns = list[Ints](), list[Ints]()
+    for k, (c, d) in enumerate(_UPPER):
+        rows.append(9 * numbers[kept] + WAVE * c + d)
+        columns.append(entries[:, k][kept])
+        if c < d:
+            rows.append(9 * numbers[kept] + WAVE * d + c)
+            columns.append(entries[:, k].transpose(0, 2, 1)[kept])
+    places = np.concatenate(rows), np.concatenate(columns)
+    return coo_array((np.ones(len(places[0])), places), (9 * count, entries.size)).tocsr()
 
 
 def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:

@@ -38,11 +38,13 @@ class Laid:
 
     def on(self, under: Image) -> Image:
         """An image with it in front."""
-        over, below = self.part, under[..., 3] / 255 * (1 - self.part)
+        laid, here = under.copy(), self.part > 0
+        over, back = self.part[here], under[here]
+        below = back[:, 3] / 255 * (1 - over)
         alpha = over + below
-        mixed = over[..., None] * self.image[..., :3] + below[..., None] * under[..., :3]
-        colours = np.where(alpha[..., None] > 0, mixed / np.maximum(alpha, 1e-9)[..., None], 255.0)
-        return np.asarray(np.rint(np.concatenate([colours, 255 * alpha[..., None]], axis=-1)), np.uint8)
+        colours = (over[:, None] * self.image[here, :3] + below[:, None] * back[:, :3]) / alpha[:, None]
+        laid[here] = np.rint(np.column_stack([colours, 255 * alpha]))
+        return laid
 
 
 class Beside:
