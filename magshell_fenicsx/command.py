@@ -6,11 +6,11 @@ Typer is imported without rich where no help is asked for: the import of rich ta
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from glob import escape, glob
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
@@ -33,6 +33,9 @@ DELIVERED = 0.2  # s in which a message is on its way to the terminal
 UNWRITTEN = "kernels cannot be compiled into"
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
 class Command(typer.core.TyperCommand):
     """A command whose help does not call None the default of what may be left out."""
 
@@ -45,7 +48,7 @@ class Command(typer.core.TyperCommand):
 class Commands(typer.Typer):
     """Commands of a program."""
 
-    def command(self, *args: Any, **kwargs: Any) -> Any:
+    def command(self, *args: Any, **kwargs: Any) -> Callable[[Function], Function]:
         return super().command(*args, cls=Command, **kwargs)
 
 

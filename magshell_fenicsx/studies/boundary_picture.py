@@ -122,7 +122,8 @@ def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) ->
 
 
 def _joined(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
-    return smooth(*map(list, zip(*places, strict=True)), located)
+    x, y = zip(*places, strict=True)
+    return smooth(x, y, located)
 
 
 def _title(content: Mapping[str, Any]) -> str:
