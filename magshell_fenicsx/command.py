@@ -33,6 +33,9 @@ DELIVERED = 0.2  # s in which a message is on its way to the terminal
 UNWRITTEN = "kernels cannot be compiled into"
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
 class Command(typer.core.TyperCommand):
     """A command whose help does not call None the default of what may be left out."""
 

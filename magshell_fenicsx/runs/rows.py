@@ -119,7 +119,7 @@ class Table(dict[str, NDArray[np.generic]]):
 
     def __missing__(self, key: object) -> NDArray[np.generic]:
         names = ", ".join([*self][3:5])
-        raise KeyError(f"{key!r}: columns have names, such as {names}; rows are those of `result.rows`")
+        raise KeyError(f"{key!r}: columns have names, such as {names}; rows are in result.rows")
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A frame of pandas, which the package does not need otherwise.

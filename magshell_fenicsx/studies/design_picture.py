@@ -78,6 +78,7 @@ def draw_design(
         _draw_history(above, rows, [result for result in results if _unit(result) == unit], unit, asked or {})
         above.tick_params(labelbottom=i == len(units) - 1)
     above.set_xlabel("evaluation (line: the best so far)")
+    above.xaxis.get_major_locator().set_params(integer=True)
     others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
     if shape is not None:
         _draw_shape(others.pop(0), shape)
