@@ -124,17 +124,30 @@ class Midsurface:
     def kinked(self) -> bool:
         """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and at joints."""
         charts = getattr(self._patch.embedding, "charts", not self.read)
-        return bool(self._patch.joints) or not charts
+        return any(self._patch.joints) or not charts
 
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
+    def beside(self, point: str) -> NDArray[np.bool_] | None:
+        """Whether each cell of this rank, ghosts included, is of the shell of a named point; None where there is one.
+
+        Another shell may have a vertex at the same place.
+        """
+        if not hasattr(self._patch.embedding, "charts"):
+            return None
+        shells = [name for name in self.patches if point.startswith(f"{name}_")]
+        return self.patches[min(shells, key=len)] if shells else None
+
     @cached_property
-    def joints(self) -> list[NDArray[np.float64]]:
-        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other."""
-        return [(1.0 * one - 1.0 * other)[self._original_cells] for one, other in self._patch.joints]
+    def joints(self) -> list[NDArray[np.float64] | None]:
+        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other.
+
+        None of a T-junction.
+        """
+        return [both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells] for both in self._patch.joints]
 
     @cached_property
     def given(self) -> NDArray[np.int64]:
