@@ -93,6 +93,10 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         for i, section in enumerate(self.given):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
+            if section.angle is not None and section.edges[1] in (context.sections.get("shells") or {}):
+                raise ValueError(
+                    f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
+                )
             for name in section.edges:
                 if name in (context.sections.get("shells") or {}):
                     continue  # on which several edges may be

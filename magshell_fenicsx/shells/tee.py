@@ -171,7 +171,7 @@ class Tee:
             upper = np.triu_indices(PARTS)
             of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", r)
             H += np.einsum("nik,nicjd,njl->nkcld", self._D, of_parts.reshape(count, 4, 3, 4, 3), self._D, optimize=True)
-        dofs = (3 * self._nodes[:, :, None] + np.arange(3)).reshape(count, -1)
+        dofs = (3 * self._nodes[:, :, None] + np.arange(3)).reshape(count, 3 * k)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
         return rows.ravel(), columns.ravel(), H.ravel()
 
