@@ -134,8 +134,11 @@ class Midsurface:
     def beside(self, point: str) -> NDArray[np.bool_] | None:
         """Whether each cell of this rank, ghosts included, is of the shell of a named point; None where there is one.
 
-        Another shell may have a vertex at the same place.
+        Another shell may have a vertex at the same place, or a sheet that stands on this one at a T-junction.
         """
+        if self._patch.feet:
+            standing = np.unique(np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet]))
+            return np.asarray(~np.isin(self._patch.corners, standing).any(axis=1)[self._original_cells])
         if not hasattr(self._patch.embedding, "charts"):
             return None
         shells = [name for name in self.patches if point.startswith(f"{name}_")]
@@ -148,6 +151,11 @@ class Midsurface:
         None of a T-junction.
         """
         return [both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells] for both in self._patch.joints]
+
+    @cached_property
+    def feet(self) -> dict[str, NDArray[np.bool_]]:
+        """Name of an edge at a T-junction of a mesh file -> whether it stands on each cell of this rank."""
+        return {name: on[self._original_cells] for name, on in self._patch.feet.items()}
 
     @cached_property
     def given(self) -> NDArray[np.int64]:

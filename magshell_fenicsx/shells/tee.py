@@ -251,8 +251,10 @@ def _angle(tangents: fem.Function, moved: fem.Function, fill: fem.Function) -> E
 def tees(model: "ShellModel") -> list[Tee]:
     """The T-junctions of a model; collective."""
     joints, surface = model.loads.joints, model.midsurface
-    number = [i for i, marks in enumerate(surface.joints) if marks is None]
-    if not number:
+    pairs = enumerate(zip(joints, surface.joints, strict=True))
+    found = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
+    found += [(Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items()]
+    if not found:
         return []
     cells = model.V.mesh.topology.index_map(2)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
@@ -261,17 +263,6 @@ def tees(model: "ShellModel") -> list[Tee]:
         factors *= np.column_stack([t, t**3])
     if model.made_of is not None:
         factors *= model.made_of.x.array.reshape(-1, 3)[model.made_of.function_space.dofmap.list[:, 0], :1]
-    return [
-        Tee(
-            joints[i],
-            f"joints.{i}.edges",
-            model.r0,
-            model.u,
-            surface.edges[joints[i].edges[0]],
-            surface.patches[joints[i].edges[1]],
-            factors,
-            model.material,
-            model.kernels,
-        )
-        for i in number
-    ]
+    given = model.r0, model.u
+    others = factors, model.material, model.kernels
+    return [Tee(joint, key, *given, surface.edges[joint.edges[0]], on, *others) for joint, key, on in found]

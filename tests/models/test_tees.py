@@ -1,9 +1,11 @@
 """T-junctions: a stiffened plate against its beam, a plate that a web twists, derivatives, ranks, and messages."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.coupled import times
@@ -65,6 +67,36 @@ def test_stiffened_plate(modulus: float) -> None:
     EI = WIDTH * D + flange * axis**2 + web * height**2 / 12 + web * (height / 2 - axis) ** 2
     _, _, seen = end(stiffened(length, height, modulus))
     assert seen["base_tip_uz"] == pytest.approx(1e-9 * length**3 / (3 * EI), rel=3e-3)
+
+
+@pytest.mark.parametrize("height", [0.1, -0.1])
+def test_a_mesh_file_in_which_edges_have_three_triangles(tmp_path: Path, height: float) -> None:
+    """The same plate, read: the beam's deflection, 3e-3; with a web on both sides too, as an edge with four."""
+    length, parts = 4.0, (16, 2)
+    sheets = [
+        Sheet("base", (0, 0, 0), (length, 0, 0), (0, WIDTH, 0), parts),
+        Sheet("web", (0, WIDTH / 2, 0), (length, 0, 0), (0, 0, abs(height)), (16, 1)),
+    ]
+    EI = WIDTH * D
+    if height > 0:
+        axis = height**2 * h / 2 / (WIDTH * h + height * h)
+        EI += WIDTH * h * axis**2 + h * height**3 / 12 + height * h * (height / 2 - axis) ** 2
+    else:
+        sheets.append(Sheet("keel", (0, WIDTH / 2, 0), (length, 0, 0), (0, 0, height), (16, 1)))
+        EI += h * (2 * abs(height)) ** 3 / 12
+    file = write(tmp_path / "beam.msh", sheets, joined=True)
+    data = {
+        "shell": {"geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1,
+                  "poisson_ratio": 0},
+        "boundary": {f"{sheet.name}_4": "clamped" for sheet in sheets},
+        "points": {"tip": [length, WIDTH / 2, 0]},
+        "mesh": {"degree": 3},
+        "symmetry": "none",
+        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "base_2", "force": [0, 0, 1e-9]}],
+                    "factor": 1, "points": 1},
+    }  # fmt: skip
+    _, _, seen = end(data)
+    assert seen["tip_uz"] == pytest.approx(1e-9 * length**3 / (3 * EI), rel=3e-3)
 
 
 def test_a_web_that_turns_a_plate() -> None:
