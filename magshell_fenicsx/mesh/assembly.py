@@ -188,11 +188,12 @@ def joined(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
     for number, edges in enumerate(joints):
         patch = patch if tees[number] else glued(patch, edges, f"joints.{number}.edges")
     sides = [
-        None if tee else tuple(_beside(patch, name) for name in edges) for tee, edges in zip(tees, joints, strict=True)
+        None if tee else (_beside(patch, edges[0]), _beside(patch, edges[1]))
+        for tee, edges in zip(tees, joints, strict=True)
     ]
     both = {name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee}
     border = {name: pairs for name, pairs in patch.edges.items() if name not in both}
-    return replace(patch, edges=border, joints=tuple(each and (each[0], each[1]) for each in sides))
+    return replace(patch, edges=border, joints=tuple(sides))
 
 
 def on_shell(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:

@@ -138,7 +138,8 @@ class Midsurface:
         """
         if self._patch.feet:
             standing = np.unique(np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet]))
-            return np.asarray(~np.isin(self._patch.corners, standing).any(axis=1)[self._original_cells])
+            stands = np.asarray(np.isin(self._patch.corners, standing).any(axis=1))
+            return np.asarray(~stands[self._original_cells])
         if not hasattr(self._patch.embedding, "charts"):
             return None
         shells = [name for name in self.patches if point.startswith(f"{name}_")]

@@ -55,12 +55,14 @@ def test_two_shells_from_python() -> None:
     thick = {"lower": "0.5 mm", "upper": "0.8 mm"}
     lower = ms.Shell("cap", name="lower", thickness=thick["lower"], **keys)
     place = {"position": [0, 0, "60 mm"], "axis": {"polar": 180}}
-    upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, **keys)
+    finer = {"size": "5 mm"}
+    upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, mesh=finer, **keys)
     points = {"lower.tip": [0, 0, "25 mm"], "upper.tip": [0, 0, "25 mm"]}
     clamped = ms.Clamped("lower.rim", "upper.rim")
     both = ms.run(ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points)).rows[-1]
     for name, sign in (("lower", 1), ("upper", -1)):
         alone = ms.Shell("cap", thickness=thick[name], **keys)
-        parts = (ms.Clamped("rim"), ms.Pressure(**load), mesh)
+        elements = ms.Section("mesh", degree=2, **(finer if name == "upper" else {"size": "8 mm"}))
+        parts = (ms.Clamped("rim"), ms.Pressure(**load), elements)
         row = ms.run(ms.Problem(alone, *parts, points={"tip": [0, 0, "25 mm"]}, symmetry="none")).rows[-1]
         assert both[f"{name}_tip_uz"] == pytest.approx(sign * row["tip_uz"], rel=1e-6)
