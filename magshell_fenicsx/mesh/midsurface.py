@@ -142,8 +142,8 @@ class Midsurface:
             return np.asarray(~stands[self._original_cells])
         if not hasattr(self._patch.embedding, "charts"):
             return None
-        shells = [name for name in self.patches if point.startswith(f"{name}_")]
-        return self.patches[min(shells, key=len)] if shells else None
+        shells = np.rint(self._patch.nodes[self._patch.cells[:, 0], -1])  # the last number of a node is its shell's
+        return np.asarray((shells == np.rint(self._patch.points[point][-1]))[self._original_cells])
 
     @cached_property
     def joints(self) -> list[NDArray[np.float64] | None]:
