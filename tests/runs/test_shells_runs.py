@@ -34,6 +34,21 @@ def test_ranks(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_ranks_of_a_junction(tmp_path: Path) -> None:
+    """1, 2 and 3, of which one has no part of the edge: 1e-9."""
+    short = ["--set=mesh.size=25 mm", "--set=loading.points=1", "--no-pictures"]
+    case = ["run", str(CASES / "stiffened_plate.yaml"), *short, "--out"]
+    assert magshell(*case, str(tmp_path / "1")).returncode == 0
+    for ranks in (2, 3):
+        done = all_started([[*case, str(tmp_path / str(ranks))]], ranks)
+        assert done.returncode == 0, done.stderr
+    one, *others = (read_path(tmp_path / str(ranks))[-1] for ranks in (1, 2, 3))
+    for other in others:
+        for column in ("w_over_h", "plate_tip_uz", "energy"):
+            assert float(other[column]) == pytest.approx(float(one[column]), rel=1e-9), column
+
+
+@pytest.mark.slow
 def test_resume(tmp_path: Path) -> None:
     """Killed on the way and resumed: the same rows to the last digit."""
     assert magshell(*command(tmp_path / "whole")).returncode == 0
