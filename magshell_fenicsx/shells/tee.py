@@ -263,6 +263,17 @@ def tees(model: "ShellModel") -> list[Tee]:
         factors *= np.column_stack([t, t**3])
     if model.made_of is not None:
         factors *= model.made_of.x.array.reshape(-1, 3)[model.made_of.function_space.dofmap.list[:, 0], :1]
-    given = model.r0, model.u
-    others = factors, model.material, model.kernels
-    return [Tee(joint, key, *given, surface.edges[joint.edges[0]], on, *others) for joint, key, on in found]
+    return [
+        Tee(
+            joint,
+            key,
+            model.r0,
+            model.u,
+            surface.edges[joint.edges[0]],
+            on,
+            factors,
+            model.material,
+            model.kernels,
+        )
+        for joint, key, on in found
+    ]
