@@ -43,9 +43,9 @@ class Shell:
         The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
     unit
         Of a mesh: the unit of its coordinates where the thickness has one; by default the metre.
-    name, place, points
-        Of one of several shells: the name before its edges and points, `upper.rim`; and where it is and its named
-        points, as a case has them under `shells`.
+    name, place, points, mesh, remanent
+        Of one of several shells: the name before its edges and points, `upper.rim`; and where it is, its named points,
+        its elements (`{"size": "2 mm"}`) and its remanence, as a case has them under `shells`.
     keys
         What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
         `thickness_factor`, a formula of the place over R or a function, is that of each place.
@@ -69,10 +69,12 @@ class Shell:
         name: str | None = None,
         place: Mapping[str, Any] | None = None,
         points: Mapping[str, Sequence[Any]] | None = None,
+        mesh: Mapping[str, Any] | None = None,
+        remanent: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> None:
         self.home: Home | None = None
-        self.name, self._own = name, {"place": place, "points": points}
+        self.name, self._own = name, {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
         if isinstance(surface, str):
@@ -101,6 +103,12 @@ class Shell:
 
     def section(self) -> Keys:
         """What a case has under `shell`."""
+        if self.name is None and (
+            strange := next((key for key, value in self._own.items() if value is not None), None)
+        ):
+            raise CaseError(
+                f"{NAME}: shell.{strange}: is of one of several shells, which have names: give it to Problem"
+            )
         return {key: self.plain(value, f"shell.{key}") for key, value in self._keys.items()}
 
     def plain(self, value: Any, key: str) -> Any:

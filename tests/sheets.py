@@ -21,16 +21,19 @@ class Sheet:
     parts: tuple[int, int]
 
 
-def write(file: Path, sheets: Sequence[Sheet]) -> Path:
-    """A mesh file of gmsh's version 2 with a patch and four edges for each sheet."""
-    nodes, elements, names = list[Array](), list[str](), list[str]()
+def write(file: Path, sheets: Sequence[Sheet], *, joined: bool = False) -> Path:
+    """A mesh file of gmsh's version 2 with a patch and four edges for each sheet; `joined`: nodes that meet are one."""
+    nodes, elements, names, kept = list[Array](), list[str](), list[str](), dict[int, int]()
     for k, sheet in enumerate(sheets):
         first, (m, n), start = len(nodes) + 1, sheet.parts, np.array(sheet.origin)
         a, b = np.array(sheet.along) / m, np.array(sheet.across) / n
         nodes += [start + i * a + j * b for j in range(n + 1) for i in range(m + 1)]
+        for number in range(first, len(nodes) + 1):
+            apart = np.linalg.norm(np.array(nodes) - nodes[number - 1], axis=1)
+            kept[number] = 1 + int(apart.round(9).argmin()) if joined else number
 
         def at(i: int, j: int, first: int = first, m: int = m) -> int:
-            return first + j * (m + 1) + i
+            return kept[first + j * (m + 1) + i]
 
         surface = 10 * k + 1
         names.append(f'2 {surface} "{sheet.name}"')

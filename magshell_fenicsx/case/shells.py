@@ -175,26 +175,20 @@ class Several:
         """Those of the shells; None where all have that of the first one."""
         from magshell_fenicsx.models.shell.parameters import OwnMaterial
 
-        first = self.parts[0].case.shell
-        found = {
-            part.name: OwnMaterial(
-                (part.case.shell.modulus or 1.0) / (first.modulus or 1.0),
-                part.case.shell.poisson_ratio,
-                (part.case.shell.density or 1.0) / (first.density or 1.0),
-            )
-            for part in self.parts
-        }
+        first, found = self.parts[0].case.shell, dict[str, OwnMaterial]()
+        for part in self.parts:
+            shell, over = part.case.shell, ("modulus", "density")
+            E, rho = ((getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in over)
+            found[part.name] = OwnMaterial(E, shell.poisson_ratio, rho)
         return None if len({*found.values()}) == 1 else found
 
     @property
     def told(self) -> list[str]:
         """What `check` says of the scales."""
-        first, materials = self.parts[0].name, self.materials or {}
-        lines = [f"scales: R, h, E, nu and the density are those of the shell {first}"]
+        lines = [f"scales: R, h, E, nu and the density are those of the shell {self.parts[0].name}"]
         for part in self.parts[1:]:
-            own = materials.get(part.name)
             said = f"h {self.ratio(part):.4g} times" + ("" if part.case.thickness_factor is None else " its factor")
-            if own:
+            if own := (self.materials or {}).get(part.name):
                 said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}, density {own.density:.4g} times"
             lines.append(f"  {part.name}: {said}")
         return lines

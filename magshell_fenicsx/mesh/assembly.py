@@ -177,20 +177,38 @@ def together(members: Sequence[Member]) -> PatchMesh:
 
 
 def joined(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
-    """With joints, whose edges are no border any more.
+    """With joints, whose edges are no border any more; the edge of a T-junction stays one.
 
     Raises
     ------
     MeshError
         See `glued`.
     """
-    sides = list[tuple[NDArray[np.bool_], ...]]()
+    tees = [on_shell(patch, edges, f"joints.{number}.edges") for number, edges in enumerate(joints)]
     for number, edges in enumerate(joints):
-        patch = glued(patch, edges, f"joints.{number}.edges")
-    for edges in joints:
-        sides.append(tuple(_beside(patch, name) for name in edges))
-    border = {name: pairs for name, pairs in patch.edges.items() if name not in {e for edges in joints for e in edges}}
-    return replace(patch, edges=border, joints=tuple((a, b) for a, b in sides))
+        patch = patch if tees[number] else glued(patch, edges, f"joints.{number}.edges")
+    sides = [
+        None if tee else (_beside(patch, edges[0]), _beside(patch, edges[1]))
+        for tee, edges in zip(tees, joints, strict=True)
+    ]
+    both = {name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee}
+    border = {name: pairs for name, pairs in patch.edges.items() if name not in both}
+    return replace(patch, edges=border, joints=tuple(sides))
+
+
+def on_shell(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
+    """Whether a joint is that of an edge on another shell, or a patch of one, which stands second.
+
+    Raises
+    ------
+    MeshError
+        If the first name is no edge; the message begins with the key.
+    """
+    if edges[1] in patch.edges or edges[1] not in patch.patches:
+        return False
+    if edges[0] not in patch.edges:
+        raise MeshError(f"{key}: {edges[0]}: is no edge; an edge stands first, and then the shell on which it is")
+    return True
 
 
 def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:

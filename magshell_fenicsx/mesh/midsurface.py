@@ -124,17 +124,39 @@ class Midsurface:
     def kinked(self) -> bool:
         """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and at joints."""
         charts = getattr(self._patch.embedding, "charts", not self.read)
-        return bool(self._patch.joints) or not charts
+        return any(self._patch.joints) or not charts
 
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
+    def beside(self, point: str) -> NDArray[np.bool_] | None:
+        """Whether each cell of this rank, ghosts included, is of the shell of a named point; None where there is one.
+
+        Another shell may have a vertex at the same place, or a sheet that stands on this one at a T-junction.
+        """
+        if self._patch.feet:
+            standing = np.unique(np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet]))
+            stands = np.asarray(np.isin(self._patch.corners, standing).any(axis=1))
+            return np.asarray(~stands[self._original_cells])
+        if not hasattr(self._patch.embedding, "charts"):
+            return None
+        shells = np.rint(self._patch.nodes[self._patch.cells[:, 0], -1])  # the last number of a node is its shell's
+        return np.asarray((shells == np.rint(self._patch.points[point][-1]))[self._original_cells])
+
     @cached_property
-    def joints(self) -> list[NDArray[np.float64]]:
-        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other."""
-        return [(1.0 * one - 1.0 * other)[self._original_cells] for one, other in self._patch.joints]
+    def joints(self) -> list[NDArray[np.float64] | None]:
+        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other.
+
+        None of a T-junction.
+        """
+        return [both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells] for both in self._patch.joints]
+
+    @cached_property
+    def feet(self) -> dict[str, NDArray[np.bool_]]:
+        """Name of an edge at a T-junction of a mesh file -> whether it stands on each cell of this rank."""
+        return {name: on[self._original_cells] for name, on in self._patch.feet.items()}
 
     @cached_property
     def given(self) -> NDArray[np.int64]:

@@ -249,6 +249,7 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
         one=None if patch.one is None else first[one[used]],
         patches={name: inside[kept] for name, inside in patch.patches.items()},
         given=None if patch.given is None else patch.given[kept],
+        feet={name: on[kept] for name, on in patch.feet.items()},
     )
 
 

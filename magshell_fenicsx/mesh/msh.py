@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.assembly import Assembly
+from magshell_fenicsx.mesh.branches import renamed, separated
 from magshell_fenicsx.mesh.midsurface import nodal_normals
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
@@ -39,13 +40,15 @@ SAME_PLACE = 1e-9  # of the extent
 TIE = 1e-6  # of the area: a difference that decides nothing
 
 
-def oriented(nodes: Array, cells: Cells) -> Cells:
+def oriented(nodes: Array, cells: Cells, torn: int | None = None) -> Cells:
     """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger area, or of a rule.
+
+    An edge has two at most. Nodes from the number `torn` on stand at places of others, see `branches.separated`.
 
     Raises
     ------
     MeshError
-        If a triangle has no area, an edge has more than two triangles, or the surface has one side or is torn.
+        If a triangle has no area, or the surface has one side or is torn.
     """
     a, b, c = (nodes[cells[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
@@ -53,10 +56,7 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
     if len(flat):
         raise MeshError(f"the triangle at {place_text(a[flat[0]])} has no area")
     edges = directed_sides(cells)
-    pairs, which, times = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    if (times > 2).any():
-        crowded = nodes[pairs[times > 2][0]].mean(axis=0)
-        raise MeshError(f"more than two triangles meet at the edge around {place_text(crowded)}")
+    _, which, times = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(which.ravel(), kind="stable")
     first = np.cumsum(times)[times == 2] - 2
     one, other = order[first], order[first + 1]
@@ -73,7 +73,7 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
         raise MeshError(
             f"the surface has only one side: its normals cannot agree across the edge around {place_text(place)}"
         )
-    _refuse_torn(nodes, cells, copy[:m])
+    _refuse_torn(nodes, cells, copy[:m], torn)
     as_first = np.empty(m, dtype=bool)
     pieces = np.minimum(copy[:m], copy[m:])
     for piece in np.unique(pieces):
@@ -101,11 +101,12 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     return False
 
 
-def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32]) -> None:
+def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32], torn: int | None) -> None:
     """See that pieces which are not connected lie apart."""
     if (copy == copy[0]).all():
         return
     vertices = np.unique(cells[:, :3])
+    vertices = vertices if torn is None else vertices[vertices < torn]
     near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
         SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
     )
@@ -246,14 +247,22 @@ def _whole(file: MeshFile) -> PatchMesh:
         edges[name] = number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
-    before, cells = cells, oriented(nodes, cells)
+    once = len(nodes)
+    origin, cells, feet = separated(nodes, cells)
+    nodes, edges = nodes[origin], renamed(edges, cells, origin) if feet else edges
+    for name, foot in feet.items():
+        if name in edges:
+            raise MeshError(f"{file.path}: the physical curve {name}: is how a T-junction is called: take another")
+        edges[name] = foot.pairs
+    before, cells = cells, oriented(nodes, cells, once if feet else None)
     turned = (cells[:, 1] != before[:, 1]).astype(np.int64)
     edges = border_edges(nodes, cells, edges)
     nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
     given = np.column_stack([np.arange(len(cells)), turned])
-    return PatchMesh(nodes, cells, in_space, edges, patches=triangles.patches, given=given)
+    on = {name: foot.on for name, foot in feet.items()}
+    return PatchMesh(nodes, cells, in_space, edges, patches=triangles.patches, given=given, feet=on)
 
 
 def cell_count(file: MeshFile) -> int:

@@ -140,7 +140,11 @@ class PatchMesh:
         (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1 where it has been
         turned over; None without.
     joints
-        Of each two edges that are glued: whether each triangle has one, and whether it has the other.
+        Of each two edges that are glued: whether each triangle has one, and whether it has the other. None for an edge
+        on another shell, of which nothing is glued.
+    feet
+        Of a mesh file in which an edge has three triangles: name of an edge that stands on another sheet -> whether
+        each triangle is one on which it does.
     """
 
     nodes: NDArray[np.float64]
@@ -151,7 +155,8 @@ class PatchMesh:
     one: NDArray[np.int64] | None = None
     patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     given: NDArray[np.int64] | None = None
-    joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]], ...] = ()
+    joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None, ...] = ()
+    feet: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     @property
     def corners(self) -> NDArray[np.int64]:

@@ -31,10 +31,11 @@ AMPLITUDE = "fold"
 
 
 class JointSection(Section):
-    """Two edges that meet, joined."""
+    """Two edges that meet, or an edge and the shell on which it is, joined."""
 
     edges: Annotated[list[str], Field(min_length=2, max_length=2)]
-    """Both, each with the name of its shell: [upper.rim, lower.rim]"""
+    """Both, each with the name of its shell: [upper.rim, lower.rim]; of a T-junction the edge, then the shell on whose
+    mid-surface it is: [stiffener.foot, plate]"""
     kind: Literal["rigid", "hinge", "spring"] = "rigid"
     """The angle between the shells stays, is free, or has a spring"""
     stiffness: Annotated[float, or_number("newton"), Field(ge=0, le=1e30)] | None = None
@@ -90,7 +91,13 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         for i, section in enumerate(self.given):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
+            if section.angle is not None and section.edges[1] in (context.sections.get("shells") or {}):
+                raise ValueError(
+                    f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
+                )
             for name in section.edges:
+                if name in (context.sections.get("shells") or {}):
+                    continue  # on which several edges may be
                 if name in taken:
                     raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")
                 taken.add(name)
@@ -182,7 +189,8 @@ class Creases:
         import numpy as np
         from dolfinx import fem
 
-        some = [(joint, of) for joint, of in zip(joints, midsurface.joints, strict=True) if not joint.rigid]
+        pairs = zip(joints, midsurface.joints, strict=True)
+        some = [(joint, of) for joint, of in pairs if not (joint.rigid or of is None)]
         if not some:
             return None
         Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))

@@ -102,12 +102,20 @@ class Observed:
         """The edges on the mirror planes of a half model or a sector; none of another."""
         return np.empty(0, dtype=np.int32)
 
-    def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
-        """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
+    def observe(
+        self,
+        volume: fem.Form,
+        points: Mapping[str, Array],
+        beside: Callable[[str], NDArray[np.bool_] | None] | None = None,
+    ) -> None:
+        """Take the volume change's form (of the modelled part), and the named vertices' places (3,).
+
+        `beside` tells the cells of this rank that may have a vertex; None for all.
+        """
         self._volume = volume
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
-        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in points.items()}
+        self._probes = {name: point_entries(V, x, np.ones(3), beside and beside(name))[0] for name, x in points.items()}
 
     def load_with(self, name: str, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads of an amplitude, except the moments."""

@@ -56,6 +56,7 @@ from magshell_fenicsx.parts.supports.supports import (
 )
 from magshell_fenicsx.parts.touching.building import touchings
 from magshell_fenicsx.shells.observed import Thin
+from magshell_fenicsx.shells.tee import tees
 from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
@@ -216,7 +217,7 @@ class ShellModel(Thin):
             elif name in midsurface.patches:
                 here = held_on(V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components)
             else:
-                here = held_at_vertex(V, midsurface.points[name], components)
+                here = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
             held += here
             self.supports[name] = Support.of(here, edge, turn)
         self.supports |= on_planes
@@ -234,7 +235,9 @@ class ShellModel(Thin):
         if loads.interaction:
             terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
-        self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
+        self.normals = {
+            name: vertex_normal(self.r0, x, midsurface.beside(name)) for name, x in midsurface.points.items()
+        }
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
         for name, dead in loads.dead.items():
@@ -244,6 +247,7 @@ class ShellModel(Thin):
         rule = carrier.contact_rule
         self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule)
         terms += self.touchings
+        terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:
@@ -284,7 +288,7 @@ class ShellModel(Thin):
         )
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
-        self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
+        self.observe(self.kernels.compile("volume energy", volume), midsurface.points, midsurface.beside)
         if loads.interaction:
             interacting.refuse_near()  # now that all is there which it reads
 
@@ -344,8 +348,9 @@ class ShellModel(Thin):
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
+        beside = self.midsurface.beside(force.point)
         if force.patch:
-            entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels)
+            entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels, beside)
         else:
-            entries = point_entries(self.V, x, inward)
+            entries = point_entries(self.V, x, inward, beside)
         return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)

@@ -192,7 +192,6 @@ MOEBIUS = [
     for cell in ([[a, b, c], [b, d, c]] if i < 11 else [[a, b, 1], [b, 0, 1]])
 ]
 WRONG = [
-    ([*TWO, [0, 4, 2]], CORNERS, FRAME, r"more than two triangles meet at the edge around \(0.5, 0.5, 0\)"),
     (
         TWO,
         CORNERS,

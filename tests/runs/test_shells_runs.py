@@ -34,6 +34,21 @@ def test_ranks(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_ranks_of_a_junction(tmp_path: Path) -> None:
+    """1, 2 and 3, of which one has no part of the edge: 1e-9."""
+    short = ["--set=mesh.size=25 mm", "--set=loading.points=1", "--no-pictures"]
+    case = ["run", str(CASES / "stiffened_plate.yaml"), *short, "--out"]
+    assert magshell(*case, str(tmp_path / "1")).returncode == 0
+    for ranks in (2, 3):
+        done = all_started([[*case, str(tmp_path / str(ranks))]], ranks)
+        assert done.returncode == 0, done.stderr
+    one, *others = (read_path(tmp_path / str(ranks))[-1] for ranks in (1, 2, 3))
+    for other in others:
+        for column in ("w_over_h", "plate_tip_uz", "energy"):
+            assert float(other[column]) == pytest.approx(float(one[column]), rel=1e-9), column
+
+
+@pytest.mark.slow
 def test_resume(tmp_path: Path) -> None:
     """Killed on the way and resumed: the same rows to the last digit."""
     assert magshell(*command(tmp_path / "whole")).returncode == 0
@@ -55,12 +70,14 @@ def test_two_shells_from_python() -> None:
     thick = {"lower": "0.5 mm", "upper": "0.8 mm"}
     lower = ms.Shell("cap", name="lower", thickness=thick["lower"], **keys)
     place = {"position": [0, 0, "60 mm"], "axis": {"polar": 180}}
-    upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, **keys)
+    finer = {"size": "5 mm"}
+    upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, mesh=finer, **keys)
     points = {"lower.tip": [0, 0, "25 mm"], "upper.tip": [0, 0, "25 mm"]}
     clamped = ms.Clamped("lower.rim", "upper.rim")
     both = ms.run(ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points)).rows[-1]
     for name, sign in (("lower", 1), ("upper", -1)):
         alone = ms.Shell("cap", thickness=thick[name], **keys)
-        parts = (ms.Clamped("rim"), ms.Pressure(**load), mesh)
+        elements = ms.Section("mesh", degree=2, **(finer if name == "upper" else {"size": "8 mm"}))
+        parts = (ms.Clamped("rim"), ms.Pressure(**load), elements)
         row = ms.run(ms.Problem(alone, *parts, points={"tip": [0, 0, "25 mm"]}, symmetry="none")).rows[-1]
         assert both[f"{name}_tip_uz"] == pytest.approx(sign * row["tip_uz"], rel=1e-6)

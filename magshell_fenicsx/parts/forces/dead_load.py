@@ -28,6 +28,7 @@ from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.platform import compat
 
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
+Inside = NDArray[np.bool_]
 COARSE = 0.15  # of the integral that a patch has on a plane; at a corner it has a quarter
 Array = NDArray[np.float64]
 
@@ -87,16 +88,29 @@ def averaged(
     return dofs, np.asarray(values / total)
 
 
-def point_entries(V: fem.FunctionSpace, x: NDArray[np.float64], direction: NDArray[np.float64]) -> Entries:
-    """l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values."""
+def point_entries(
+    V: fem.FunctionSpace, x: NDArray[np.float64], direction: NDArray[np.float64], beside: Inside | None = None
+) -> Entries:
+    """l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values.
+
+    `beside` are the cells that may have it; None for all.
+    """
     near = fem.locate_dofs_geometrical(V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9)
     owned = near[near < V.dofmap.index_map.size_local]
+    if beside is not None:
+        owned = owned[np.isin(owned, V.dofmap.list[beside])]
     dofs = (3 * owned[:, None] + np.arange(3)).ravel().astype(np.int32)
     return dofs, np.tile(direction, len(owned))
 
 
 def patch_entries(
-    r0: fem.Function, x: NDArray[np.float64], radius: float, direction: NDArray[np.float64], degree: int, log: KernelLog
+    r0: fem.Function,
+    x: NDArray[np.float64],
+    radius: float,
+    direction: NDArray[np.float64],
+    degree: int,
+    log: KernelLog,
+    beside: Inside | None = None,
 ) -> Entries:
     """l with l . u = average of direction . u around x, with the weight (1 - d^2/radius^2)^2.
 
@@ -113,11 +127,12 @@ def patch_entries(
     centre, a = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
     weight = smooth(r0 - centre, a) * kin.area_ratio(kin.jet(r0, domain))
+    weight = weight if beside is None else weight * within(domain, beside)
     return averaged(V, direction, Weighted(weight, dx), log, radius)
 
 
-def vertex_normal(r0: fem.Function, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles."""
+def vertex_normal(r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None) -> NDArray[np.float64]:
+    """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those of some cells."""
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
@@ -125,6 +140,7 @@ def vertex_normal(r0: fem.Function, x: NDArray[np.float64]) -> NDArray[np.float6
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
     a1, a2 = np.einsum("dvk,cki->dcvi", gradients, nodes)
     near = np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
+    near = near if beside is None else near & beside[:owned, None]
     total = V.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
     return np.asarray(total / np.linalg.norm(total))
 
@@ -310,4 +326,5 @@ class SurfaceMeasures:
         return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], FINER)
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
-        return point_entries(self._V, self._midsurface.points[name], force)
+        surface = self._midsurface
+        return point_entries(self._V, surface.points[name], force, surface.beside(name))

@@ -48,9 +48,12 @@ def held_on(
     return found
 
 
-def held_at_vertex(V: fem.FunctionSpace, x: Array, axes: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero at the node at a vertex."""
+def held_at_vertex(
+    V: fem.FunctionSpace, x: Array, axes: Iterable[int], beside: NDArray[np.bool_] | None = None
+) -> list[fem.DirichletBC]:
+    """Those components are zero at the node at a vertex; `beside` are the cells that may have it, None for all."""
     near = fem.locate_dofs_geometrical(V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
+    near = near if beside is None else near[np.isin(near, V.dofmap.list[beside])]
     return [fem.dirichletbc(0.0, 3 * near + np.int32(i), V.sub(i)) for i in axes]
 
 
