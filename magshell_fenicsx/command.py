@@ -32,7 +32,6 @@ PATIENCE = 5.0  # s in which an error of all ranks reaches the last of them
 DELIVERED = 0.2  # s in which a message is on its way to the terminal
 UNWRITTEN = "kernels cannot be compiled into"
 
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -43,9 +42,6 @@ class Command(typer.core.TyperCommand):
         super().__init__(*args, **kwargs)
         for each in self.params:
             each.show_default = each.default is not None and each.show_default  # type: ignore[attr-defined]
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Commands(typer.Typer):
