@@ -16,7 +16,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, whole
@@ -193,6 +192,8 @@ class Tee:
 
     def _places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """Of points (n, 3) the nearest cell of some, the place in it, and the distance."""
+        from scipy.spatial import cKDTree  # takes long to import
+
         found, Y, apart = np.zeros(len(x), dtype=np.int64), np.zeros((len(x), 2)), np.full(len(x), np.inf)
         nodal = self._r0[self._of_all.nodes[cells]]
         centres = nodal.mean(axis=1)
