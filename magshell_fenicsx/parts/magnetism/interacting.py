@@ -76,8 +76,8 @@ class InteractionTerm:
         near = False
         if not self._itself and self._parts.max() == 0:
             raise CaseError(
-                "magnetic.interaction: others: acts between shells that no joint connects, or parts of a mesh file, and "
-                "here all is one part: take interaction: all"
+                "magnetic.interaction: others: acts between shells that no joint connects, or parts of a mesh file, "
+                "and here all is one part: take interaction: all"
             )
         try:
             nodes = self._nodes()
