@@ -94,7 +94,7 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
-        self._couplings = couplings(V, terms, clamped)
+        self.couplings = couplings(V, terms, clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
@@ -263,7 +263,7 @@ class FiniteElementSystem:
             given, found = K.createVecRight(), np.zeros_like(v)
             given.array[:] = v[: self.size]
             found[: self.size] = (K * given).array
-        for each in self._couplings:
+        for each in self.couplings:
             found = found + each.times(v, factors)
         return found
 
@@ -275,7 +275,7 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
-        for each in self._couplings:
+        for each in self.couplings:
             K = each.sum(K, factors)
         if self.projection:
             K = self.projection.tangent(K)

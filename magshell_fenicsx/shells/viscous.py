@@ -5,15 +5,19 @@ stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the cu
 strains, so that rigid motions are not damped. Strains are known at the nodes of each cell and interpolated.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
 from numpy.typing import NDArray
+from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.coupled import Factors
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.carriers import Carrier, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
@@ -22,6 +26,7 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.law import Law, work
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
+from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
 
@@ -93,6 +98,8 @@ class Viscosity:
         gradients = [ufl.derivative(carrier.whole * work, model.u, ufl.TestFunction(V)) for work in works]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
         self._strained = [term.name for term in model.system.terms if term.column in ("stretching", "bending")]
+        law = model.material.law
+        self._slowing = _Slowing(model) if law.linear != law else None
         self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
         self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
         self._last: tuple[Vector, Array] = self._first
@@ -110,8 +117,11 @@ class Viscosity:
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
         """The system's tangent with that of these forces, which stiffen the shell, but no body that it touches."""
-        stiffer = 1 + self.stiffness(dt, rate)
-        return self._model.system.tangent(u, mu, times=dict.fromkeys(self._strained, stiffer))
+        stiffness = self.stiffness(dt, rate)
+        if self._slowing is None:
+            return self._model.system.tangent(u, mu, times=dict.fromkeys(self._strained, 1 + stiffness))
+        with self._slowing.by(stiffness):
+            return self._model.system.tangent(u, mu)
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
@@ -180,6 +190,50 @@ class Viscosity:
         return np.concatenate([S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1)
 
 
+class _Slowing:
+    """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's `Couplings`.
+
+    Viscous stresses are those of small strains: they make stiff what the strains of a stretched shell leave soft.
+    """
+
+    def __init__(self, model: ShellModel | MeridianModel) -> None:
+        self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
+        rates, v = _Rates(model), ufl.TestFunction(model.V)
+        self._since, whole = rates.since, model.factory.carrier.whole
+        self._forms = [
+            model.kernels.compile(f"viscous tangent {i}", whole * self._stiffness * ufl.derivative(work, model.u, v))
+            for i, work in enumerate(_works(model, rates))
+        ]
+        self._added = fem_petsc.create_matrix(self._forms[0])
+        self._system.couplings.append(self)
+
+    @contextmanager
+    def by(self, stiffness: float) -> Iterator[None]:
+        """Tangents are those with so many times this one."""
+        self._stiffness.value = stiffness
+        try:
+            yield
+        finally:
+            self._stiffness.value = 0.0
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """See `Couplings`."""
+        if not self._stiffness.value:
+            return K
+        self._since.x.array[:] = self._system.u.x.array
+        self._added.zeroEntries()
+        for form in self._forms:
+            compat.add_matrix(self._added, form, self._system.clamped)
+        self._added.assemble()
+        stiffer = K.copy()
+        stiffer.axpy(1.0, self._added, PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN)
+        return stiffer
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """See `Couplings`: viscous forces have no part in what moves a support."""
+        return np.zeros_like(v)
+
+
 def _share(branch: Branch, dt: float) -> float:
     """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
@@ -201,10 +255,36 @@ class _Given:
     after: fem.Function
     stiffness: fem.Constant
 
+    def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
+        """The strain and the change of curvature that make the stress, on a side of an edge; "" within a cell."""
+        at = self.field(side) if side else self.field
+        return covariant(j, at, 0), covariant(j, at, 6)
+
     def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
         after, before = (jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before))
         return self.stiffness * (after - before)
+
+
+class _Rates:
+    """What takes the place of `_Given` in the forces' derivative: strains and jumps by a change of a displacement."""
+
+    def __init__(self, model: ShellModel | MeridianModel) -> None:
+        self.since, self._change = fem.Function(model.V), ufl.TrialFunction(model.V)
+        self._jet = model.factory.carrier.jet(self.since)
+
+    def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
+        """See `_Given`."""
+        E, K = _strained(j, self._jet.side(side) if side else self._jet)
+        return ufl.derivative(E, self.since, self._change), ufl.derivative(K, self.since, self._change)
+
+    def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
+        """See `_Given`."""
+        return ufl.derivative(jump(carrier.j0 + self._jet), self.since, self._change)
+
+
+def _strained(j: Jet, u: Jet) -> tuple[Expr, Expr]:
+    return kin.membrane_strain(j, u), kin.curvature_change(j, u)
 
 
 def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
@@ -227,12 +307,12 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
     return held_jump(r0, m, n0 if edge.turn is None else ufl.dot(edge.turn, n0))
 
 
-def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
+def _works(model: ShellModel | MeridianModel, given: _Given | _Rates) -> list[ufl.Form]:
     """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
 
     Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.
     """
-    factory, carrier, field = model.factory, model.factory.carrier, given.field
+    factory, carrier = model.factory, model.factory.carrier
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
 
     def law(j: Jet, side: str = "") -> Law:
@@ -241,16 +321,8 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
         return of_shell if own is None else of_shell.made_of(*((own(side) if side else own)[i] for i in range(2)))
 
-    def viscous(j: Jet, side: str = "") -> tuple[Expr, Expr]:
-        """The given strain and change of curvature."""
-        at = field(side) if side else field
-        return covariant(j, at, 0), covariant(j, at, 6)
-
-    def strained(j: Jet, u: Jet) -> tuple[Expr, Expr]:
-        return kin.membrane_strain(j, u), kin.curvature_change(j, u)
-
-    E, K = strained(r0, u)
-    strain, bend = viscous(r0)
+    E, K = _strained(r0, u)
+    strain, bend = given.strain(r0, "")
     up = kin.inverse_metric(r0)
     own = law(r0)
     stretching, bending = work(own.stress(strain, up), E), work(own.moment(strain, bend, up), K)
@@ -270,8 +342,8 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     given_moment, bent, stiff = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
         edge = kin.inverse_metric(j), (nu1, nu2), 1
-        given_moment += law(j, side).edge_moment(*viscous(j, side), *edge) / 2
-        bent += law(j, side).edge_moment(*strained(j, v), *edge) / 2
+        given_moment += law(j, side).edge_moment(*given.strain(j, side), *edge) / 2
+        bent += law(j, side).edge_moment(*_strained(j, v), *edge) / 2
         stiff += law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
     S_J, J = given.opened(carrier, across), across(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2

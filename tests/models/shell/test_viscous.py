@@ -82,6 +82,19 @@ def test_viscous_plies_are_as_stiff() -> None:
     assert force[free] == pytest.approx(2 * elastic[free], abs=1e-5 * np.abs(elastic).max())
 
 
+def test_tangent_of_viscous_rubber() -> None:
+    """Half a strip, stretched by a third: what viscosity adds to the tangent is its force by the velocity."""
+    rubber = {"law": "neo-hookean", "poisson_ratio": 0.5, "viscosity": 2.0}
+    model = Scene(case_of(rubber, {"duration": 1.0}, degree=2)).model
+    x, y, _ = model.r0.x.array.reshape(-1, 3).T
+    u, v = (np.column_stack(of).ravel() for of in ([0.3 * x, -0.1 * x * y, 0.2 * x**2], [x, x * y, x**2]))
+    viscous, rate = Viscosity(model, {}, 2.0, []), 3.0  # type: ignore[arg-type]
+    added = csr(viscous.tangent(u, {}, 0.1, rate)) @ v - csr(model.system.tangent(u, {})) @ v
+    free = np.flatnonzero(model.system.held(np.ones(v.size)))
+    force = viscous.force(u, u, v, 1.0, 0.0)
+    assert added[free] / rate == pytest.approx(force[free], abs=1e-4 * np.abs(force[free]).max())
+
+
 def test_creep() -> None:
     """Under a load c t, slow against all vibrations, w is c (t - g tau (1 - exp(-t/((1 + g) tau))))."""
     g, tau = 0.5, 1e4 / OMEGA
