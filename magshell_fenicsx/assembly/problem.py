@@ -263,8 +263,8 @@ class FiniteElementSystem:
             given, found = K.createVecRight(), np.zeros_like(v)
             given.array[:] = v[: self.size]
             found[: self.size] = (K * given).array
-        for each in self._couplings:
-            found = found + each.times(v, factors)
+        for coupling in self._couplings:
+            found = found + coupling.times(v, factors)
         return found
 
     def _tangent(
@@ -275,8 +275,8 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
-        for each in self._couplings:
-            K = each.sum(K, factors)
+        for coupling in self._couplings:
+            K = coupling.sum(K, factors)
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:

@@ -93,7 +93,7 @@ class Near:
     shape
         All cells that are modelled.
     corners
-        (copies cells, 3) numbers of the corners of all copies.
+        (copies * cells, 3) numbers of the corners of all copies.
     cells, edges
         Edges that may be charged, by cell and local number.
     own
