@@ -106,7 +106,8 @@ class Tee:
         self._turns = bool(joint.rigid or joint.stiffness)
         self._points = Points(max(len(x), 1))
         self._tangents, self._moved = self._points.field(PARTS), self._points.field(PARTS)
-        fixed = self._points.field(5)  # direction along the edge, sine and cosine of the placement, stiffness
+        # direction along the edge, sine and cosine of the placement, stiffness
+        self._fixed = fixed = self._points.field(5)
         angle = _angle(self._tangents, self._moved, fixed)
         sine = angle[0] * fixed[3] - angle[1] * fixed[2]
         cosine = angle[1] * fixed[3] + angle[0] * fixed[2]
