@@ -40,12 +40,12 @@ class Command(typer.core.TyperCommand):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        for each in self.params:
-            each.show_default = each.default is not None and each.show_default  # type: ignore[attr-defined]
+        for param in self.params:
+            param.show_default = param.default is not None and param.show_default  # type: ignore[attr-defined]
 
 
 class Commands(typer.Typer):
-    """Commands of a program."""
+    """Commands of a program, each a `Command`."""
 
     def command(self, *args: Any, **kwargs: Any) -> Callable[[Function], Function]:
         return super().command(*args, cls=Command, **kwargs)

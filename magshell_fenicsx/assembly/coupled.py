@@ -1,4 +1,4 @@
-"""Terms whose tangent has entries outside the pattern of the others: of some unknowns, or of all of them.
+"""Terms whose tangent has entries outside the pattern of the others: between some unknowns, or between all of them.
 
 The couplings of contact change from state to state: their entries are added to a copy of the sparse matrix. Where all
 unknowns act on each other the sum has all its entries (`assembly.whole.WholeMatrix`).
@@ -33,16 +33,16 @@ class Couplings(Protocol):
 
 
 def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:
-    """Those of terms, most of which have none; `clamped` are homogeneous conditions."""
-    some = [t for t in terms if isinstance(t, Coupled)]
+    """What the terms among these add that are `Coupled` or a `WholeTerm`; `clamped` are homogeneous conditions."""
+    coupled = [t for t in terms if isinstance(t, Coupled)]
     of_all = [t for t in terms if isinstance(t, WholeTerm)]
-    found: list[Couplings] = [ChangingEntries(V, some, clamped)] if some else []
-    return [*found, OfAll(WholeMatrix(V, clamped), of_all)] if of_all else found
+    changing: list[Couplings] = [ChangingEntries(V, coupled, clamped)] if coupled else []
+    return [*changing, OfAll(WholeMatrix(V, clamped), of_all)] if of_all else changing
 
 
 @dataclass(frozen=True)
 class OfAll:
-    """Those of terms in which all unknowns act on each other."""
+    """Those of terms in which all unknowns act on each other: the sum of the tangent is a dense matrix."""
 
     matrix: WholeMatrix
     terms: Sequence[WholeTerm]
@@ -70,7 +70,7 @@ class Coupled(Protocol):
 
 
 class ChangingEntries:
-    """The entries of coupled terms."""
+    """The entries of coupled terms, which change from state to state."""
 
     def __init__(self, V: fem.FunctionSpace, terms: Sequence[Coupled], clamped: Sequence[fem.DirichletBC]) -> None:
         self._terms, self._comm = terms, V.mesh.comm
@@ -88,11 +88,11 @@ class ChangingEntries:
 
     def times(self, v: Array, factors: Factors) -> Array:
         """See `Couplings`."""
-        found, size = np.zeros_like(v), self._own.stop - self._own.start
+        product, size = np.zeros_like(v), self._own.stop - self._own.start
         if entries := self._entries(factors):
             parts = times(entries, np.concatenate(self._comm.allgather(v[:size])))
-            found[:size] = self._comm.allreduce(parts)[self._own]
-        return found
+            product[:size] = self._comm.allreduce(parts)[self._own]
+        return product
 
     def _entries(self, factors: Factors) -> list[tuple[float, Entries]]:
         return [(factor, t.entries()) for t in self._terms if (factor := factors.get(t.name, 0.0))]

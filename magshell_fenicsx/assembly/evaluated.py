@@ -98,11 +98,12 @@ class Evaluated:
             whole = system._summed(system._gradient(factors))
             if not system._finite(whole.sum()):
                 system.strange = self._not_numbers(factors)
-            return whole if system.projection is None else whole + system.projection.outside(self._u)
-        V = system.u.function_space.dofmap
-        parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
-        noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]
-        return np.asarray(np.sum(noisy, axis=0))
+        else:
+            V = system.u.function_space.dofmap
+            parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
+            noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]
+            whole = np.asarray(np.sum(noisy, axis=0))
+        return whole if system.projection is None else whole + system.projection.outside(self._u)
 
     def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
         """The terms whose energy or gradient is not a number; collective."""

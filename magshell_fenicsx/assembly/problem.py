@@ -257,15 +257,15 @@ class FiniteElementSystem:
     def _times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
         """This rank's part of the tangent without supports times a vector, both with ghosts."""
         if self._assembler:
-            found = self._assembler.times(v, factors)
+            product = self._assembler.times(v, factors)
         else:
             K = self._of_forms(self._unheld, factors, [])
-            given, found = K.createVecRight(), np.zeros_like(v)
+            given, product = K.createVecRight(), np.zeros_like(v)
             given.array[:] = v[: self.size]
-            found[: self.size] = (K * given).array
-        for each in self.couplings:
-            found = found + each.times(v, factors)
-        return found
+            product[: self.size] = (K * given).array
+        for coupling in self.couplings:
+            product = product + coupling.times(v, factors)
+        return product
 
     def _tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
@@ -275,8 +275,8 @@ class FiniteElementSystem:
             K = self._assembler.tangent(factors, stress)
         else:
             K = self._of_forms(self._K, factors, self.clamped)
-        for each in self.couplings:
-            K = each.sum(K, factors)
+        for coupling in self.couplings:
+            K = coupling.sum(K, factors)
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:

@@ -67,9 +67,9 @@ class Case(WithParts):
     points: dict[str, Coordinates] = Field(default_factory=dict)
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     shells: Shells | None = None
-    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. The R of the
-    first is that of formulas and results, its thickness the h of these; all have one material. The edge or point `rim`
-    of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
+    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. Formulas
+    and results are over the R, h, E and density of the first. The edge or point `rim` of the shell `upper` is
+    `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)

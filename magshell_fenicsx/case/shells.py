@@ -172,15 +172,15 @@ class Several:
 
     @cached_property
     def materials(self) -> "dict[str, OwnMaterial] | None":
-        """Those of the shells; None where all have that of the first one."""
+        """Name of a shell -> its material over that of the first; None where all have that one."""
         from magshell_fenicsx.models.shell.parameters import OwnMaterial
 
-        first, found = self.parts[0].case.shell, dict[str, OwnMaterial]()
+        first, own = self.parts[0].case.shell, dict[str, OwnMaterial]()
         for part in self.parts:
-            shell, over = part.case.shell, ("modulus", "density")
-            E, rho = ((getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in over)
-            found[part.name] = OwnMaterial(E, shell.poisson_ratio, rho)
-        return None if len({*found.values()}) == 1 else found
+            shell, keys = part.case.shell, ("modulus", "density")
+            E, rho = ((getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys)
+            own[part.name] = OwnMaterial(E, shell.poisson_ratio, rho)
+        return None if len({*own.values()}) == 1 else own
 
     @property
     def told(self) -> list[str]:
@@ -319,7 +319,7 @@ def _presses(loading: Any, name: str) -> bool:
 
 
 def _merged(parts: Sequence[Part]) -> Keys:
-    """Keys of the shell that stands for all: lengths and material, which results are over, are those of the first."""
+    """Keys of the shell that stands for all: with lengths and material of the first, which results are over."""
     first, shell = parts[0], parts[0].case.shell
     for part in parts:
         other = part.case.shell

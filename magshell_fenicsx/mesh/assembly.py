@@ -191,13 +191,13 @@ def joined(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
         None if tee else (_beside(patch, edges[0]), _beside(patch, edges[1]))
         for tee, edges in zip(tees, joints, strict=True)
     ]
-    both = {name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee}
-    border = {name: pairs for name, pairs in patch.edges.items() if name not in both}
+    glued_names = {name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee}
+    border = {name: pairs for name, pairs in patch.edges.items() if name not in glued_names}
     return replace(patch, edges=border, joints=tuple(sides))
 
 
 def on_shell(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
-    """Whether a joint is that of an edge on another shell, or a patch of one, which stands second.
+    """Whether a joint sets an edge, which stands first, on another shell or on a patch of one.
 
     Raises
     ------

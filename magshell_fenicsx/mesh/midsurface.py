@@ -132,7 +132,7 @@ class Midsurface:
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
     def beside(self, point: str) -> NDArray[np.bool_] | None:
-        """Whether each cell of this rank, ghosts included, is of the shell of a named point; None where there is one.
+        """Whether each cell of this rank, ghosts too, is of the shell of a named point; None if there is one shell.
 
         Another shell may have a vertex at the same place, or a sheet that stands on this one at a T-junction.
         """
@@ -147,9 +147,9 @@ class Midsurface:
 
     @cached_property
     def joints(self) -> list[NDArray[np.float64] | None]:
-        """Of each joint a number for each cell of this rank, ghosts included: 1 on its one edge, -1 on the other.
+        """For each joint a number of each cell of this rank, ghosts too: 1 on its one edge, -1 on the other, else 0.
 
-        None of a T-junction.
+        A T-junction has None.
         """
         return [both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells] for both in self._patch.joints]
 

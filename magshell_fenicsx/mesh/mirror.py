@@ -117,7 +117,7 @@ class Mirror:
         return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
 
     def keeps_lines(self, along: Array | None) -> bool:
-        """Whether it maps lines along a vector (3,), of none along the meridians of e3, onto such lines."""
+        """Whether images of lines along a vector (3,), or if None of meridians about e3, are such lines."""
         if along is None:
             through = abs(self.offset) < STRAIGHT or abs(float(self.normal[2])) > STRAIGHT
             return through and self.keeps_lines(np.eye(3)[2])

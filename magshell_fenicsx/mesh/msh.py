@@ -40,10 +40,10 @@ SAME_PLACE = 1e-9  # of the extent
 TIE = 1e-6  # of the area: a difference that decides nothing
 
 
-def oriented(nodes: Array, cells: Cells, torn: int | None = None) -> Cells:
+def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
     """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger area, or of a rule.
 
-    An edge has two at most. Nodes from the number `torn` on stand at places of others, see `branches.separated`.
+    An edge has two at most. Nodes from `first_copy` on stand at places of others: see `branches.separated`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def oriented(nodes: Array, cells: Cells, torn: int | None = None) -> Cells:
         raise MeshError(
             f"the surface has only one side: its normals cannot agree across the edge around {place_text(place)}"
         )
-    _refuse_torn(nodes, cells, copy[:m], torn)
+    _refuse_torn(nodes, cells, copy[:m], first_copy)
     as_first = np.empty(m, dtype=bool)
     pieces = np.minimum(copy[:m], copy[m:])
     for piece in np.unique(pieces):
@@ -101,12 +101,12 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     return False
 
 
-def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32], torn: int | None) -> None:
+def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32], first_copy: int | None) -> None:
     """See that pieces which are not connected lie apart."""
     if (copy == copy[0]).all():
         return
     vertices = np.unique(cells[:, :3])
-    vertices = vertices if torn is None else vertices[vertices < torn]
+    vertices = vertices if first_copy is None else vertices[vertices < first_copy]
     near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
         SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
     )
@@ -247,14 +247,14 @@ def _whole(file: MeshFile) -> PatchMesh:
         edges[name] = number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
-    once = len(nodes)
+    first_copy = len(nodes)
     origin, cells, feet = separated(nodes, cells)
     nodes, edges = nodes[origin], renamed(edges, cells, origin) if feet else edges
     for name, foot in feet.items():
         if name in edges:
             raise MeshError(f"{file.path}: the physical curve {name}: is how a T-junction is called: take another")
         edges[name] = foot.pairs
-    before, cells = cells, oriented(nodes, cells, once if feet else None)
+    before, cells = cells, oriented(nodes, cells, first_copy if feet else None)
     turned = (cells[:, 1] != before[:, 1]).astype(np.int64)
     edges = border_edges(nodes, cells, edges)
     nodes = nodes * file.scale

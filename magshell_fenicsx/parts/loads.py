@@ -84,10 +84,10 @@ def moments(loads: Iterable[DeadLoad]) -> list[EdgeMoment]:
 
 
 def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
-    """The energies of those that depend on the deformed place."""
+    """The energies of the dead loads that depend on the deformed place."""
     return [load.term for load in loads if isinstance(load, Potential)]
 
 
 def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
-    """All others: their work is their size times a displacement along themselves."""
+    """The forces among dead loads: each does the work of its size times a displacement along itself."""
     return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]

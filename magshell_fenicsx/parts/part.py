@@ -79,15 +79,15 @@ class Context:
 
     @property
     def withdrawn(self) -> "dict[Offer, str]":
-        """What the case has not, of what abilities may need -> what to do."""
-        found = dict[Offer, str]()
+        """What abilities may need and the case has not -> what to do about that."""
+        missing = dict[Offer, str]()
         for ability in self.abilities:
-            found |= ability.withdraws(self)
+            missing |= ability.withdraws(self)
         if self.solid:
-            found["a mid-surface"] = "a solid has none: take model: shell"
+            missing["a mid-surface"] = "a solid has none: take model: shell"
         if self.shell.thickness_factor is not None:
-            found["the same thickness everywhere"] = "leave out shell.thickness_factor"
-        return found
+            missing["the same thickness everywhere"] = "leave out shell.thickness_factor"
+        return missing
 
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
         """See that the case has what a key needs.

@@ -73,7 +73,7 @@ class Unit:
     needs
         What a case must have for such a text.
     words, symbol
-        Of the column in that unit, if they are not those of the quantity; one without a symbol gets none.
+        Of the column in that unit, if they are not those of the quantity; a quantity without a symbol gets none.
     """
 
     key: str

@@ -157,8 +157,8 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
 
     If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
     """
-    found = weight(model) if vibrating else None
-    factor, name = (1.0, "") if found is None else (found, "weighted ")
+    of_mass = weight(model) if vibrating else None
+    factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
     mass = f"{name}mass", of_displacements(model, factor)
 
     def of(label: str, system: FiniteElementSystem) -> _Family:

@@ -81,53 +81,47 @@ class Tee:
         self._element = element
         first = self._of_all.own.start
         cells, ends = _sides(V, foot, len(self._of_all.own))
-        X, weights = basix.make_quadrature(basix.CellType.interval, 2 * element.degree - 1)
-        at = ends[:, None, 0] + X[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
-        along = np.repeat(ends[:, 1] - ends[:, 0], len(X), axis=0)
-        cell = np.repeat(first + cells, len(X))
-        one = self._shapes(at.reshape(-1, 2))
+        s, weights = basix.make_quadrature(basix.CellType.interval, 2 * element.degree - 1)
+        X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
+        along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
+        cell = np.repeat(first + cells, len(s))
+        on_edge = self._shapes(X.reshape(-1, 2))
         nodes = self._of_all.nodes
-        x = np.einsum("nk,nki->ni", one[0], self._r0[nodes[cell]])
-        tangent = np.einsum("na,ank,nki->ni", along, one[1:], self._r0[nodes[cell]])
-        speed = np.linalg.norm(tangent, axis=1)
-        length = np.repeat(np.sum((speed * np.tile(weights, len(cells))).reshape(-1, len(X)), axis=1), len(X))
+        x = np.einsum("nk,nki->ni", on_edge[0], self._r0[nodes[cell]])
+        tangent = np.einsum("na,ank,nki->ni", along, on_edge[1:], self._r0[nodes[cell]])
+        weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
+        length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
         other, Y, apart = self._places(x, np.flatnonzero(self._of_all.gathered(on)))
         self._refuse_apart(apart, x, material.h, key, joint)
-        two = self._shapes(Y)
+        on_other = self._shapes(Y)
         self._nodes = np.concatenate([nodes[cell], nodes[other]], axis=1)
-        self._beta = np.concatenate([one[0], -two[0]], axis=1)
+        self._beta = np.concatenate([on_edge[0], -on_other[0]], axis=1)
         self._D = np.zeros((len(x), 4, self._nodes.shape[1]))
         half = nodes.shape[1]
-        self._D[:, :2, :half], self._D[:, 2:, half:] = (each[1:].transpose(1, 0, 2) for each in (one, two))
-        known = self._of_all.gathered(stiffness)
-        stiff = np.maximum(known[cell], known[other]) / length[:, None]
-        weight = np.tile(weights, len(cells)) * speed
+        self._D[:, :2, :half], self._D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (on_edge, on_other))
+        of_cells = self._of_all.gathered(stiffness)
+        stiff = np.maximum(of_cells[cell], of_cells[other]) / length[:, None]
         self._tie = weight * TIGHT * stiff[:, 0]
         turned = weight * (TIGHT * stiff[:, 1] * material.bending_stiffness if joint.rigid else joint.stiffness)
         self._turns = bool(joint.rigid or joint.stiffness)
         self._points = Points(max(len(x), 1))
         self._tangents, self._moved = self._points.field(PARTS), self._points.field(PARTS)
-        self._fill = self._points.field(5)  # direction along the edge, sine and cosine of the placement, stiffness
-        log_of = (log, self._comm)
-        angle = _angle(self._tangents, self._moved, self._fill)
-        W = (
-            self._fill[4]
-            / 2
-            * ufl.atan2(
-                angle[0] * self._fill[3] - angle[1] * self._fill[2], angle[1] * self._fill[3] + angle[0] * self._fill[2]
-            )
-            ** 2
-        )
-        filled = self._filled = self._fill.x.array.reshape(-1, 5)
+        # direction along the edge, sine and cosine of the placement, stiffness
+        self._fixed = fixed = self._points.field(5)
+        angle = _angle(self._tangents, self._moved, fixed)
+        sine = angle[0] * fixed[3] - angle[1] * fixed[2]
+        cosine = angle[1] * fixed[3] + angle[0] * fixed[2]
+        W = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
-        filled[: len(x), :2], filled[: len(x), 4] = along, turned
         self._kernels: Mapping[str, PointKernel] = {
-            "angle": point_values("T-junction angle", angle, *log_of),
-            "energy": point_values("T-junction energy", W, *log_of),
-            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], *log_of),
-            "hessian": whole_hessian("T-junction Hessian", W, self._moved, *log_of),
+            "angle": point_values("T-junction angle", angle, log, self._comm),
+            "energy": point_values("T-junction energy", W, log, self._comm),
+            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log, self._comm),
+            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log, self._comm),
         }
-        filled[: len(x), 2:4] = self._at("angle", self._r0)
+        values = fixed.x.array.reshape(-1, 5)[: len(x)]
+        values[:, :2], values[:, 4] = along, turned
+        values[:, 2:4] = self._at("angle", self._r0)
 
     # as a term
 
@@ -144,16 +138,16 @@ class Tee:
         return tied + (float(self._at("energy", self._r0 + u).sum()) if self._turns else 0.0)
 
     def add_residual(self, b: Array, factor: float) -> None:
-        u, found = whole(self._u), np.zeros(self._r0.shape)
+        u, residual = whole(self._u), np.zeros(self._r0.shape)
         forces = (self._tie[:, None] * self._gap(u))[:, None, :] * self._beta[:, :, None]
         if self._turns:
             g = self._at("gradient", self._r0 + u).reshape(-1, 4, 3)
             forces = forces + np.einsum("nik,nic->nkc", self._D, g)
-        np.add.at(found, self._nodes, factor * forces)
+        np.add.at(residual, self._nodes, factor * forces)
         if self._comm.size > 1:
-            found = np.asarray(self._comm.allreduce(found))
+            residual = np.asarray(self._comm.allreduce(residual))
         start, size = self._own
-        b[:size] += found.ravel()[start : start + size]
+        b[:size] += residual.ravel()[start : start + size]
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
@@ -177,10 +171,11 @@ class Tee:
     # geometry
 
     def _gap(self, u: Array) -> Array:
+        """u - u' (n, 3) at the points, from the displacement (nodes, 3) of all nodes."""
         return np.asarray(np.einsum("nk,nkc->nc", self._beta, u[self._nodes]))
 
     def _at(self, kernel: str, r: Array) -> Array:
-        """What a kernel gives at placed nodes (nodes, 3)."""
+        """(n, ..) what a kernel gives at the points, where the nodes are at r (nodes, 3)."""
         count = len(self._nodes)
         z = np.einsum("nik,nkc->nic", self._D, r[self._nodes])
         self._tangents.x.array[: count * PARTS] = z.ravel()
@@ -191,29 +186,29 @@ class Tee:
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
     def _places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
-        """Of points (n, 3) the nearest cell of some, the place in it, and the distance."""
+        """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance, inf without a cell."""
         from scipy.spatial import cKDTree  # takes long to import
 
-        found, Y, apart = np.zeros(len(x), dtype=np.int64), np.zeros((len(x), 2)), np.full(len(x), np.inf)
+        nearest, Y, apart = np.zeros(len(x), dtype=np.int64), np.zeros((len(x), 2)), np.full(len(x), np.inf)
         nodal = self._r0[self._of_all.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = AROUND * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
         near = cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
-        point = np.repeat(np.arange(len(x)), [len(each) for each in near])
-        which = np.concatenate([np.asarray(each, dtype=np.int64) for each in (*near, [])])
+        point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in near])
+        which = np.concatenate([np.asarray(numbers, dtype=np.int64) for numbers in (*near, [])])
         if not len(point):
-            return found, Y, apart
-        of = Cells(self._element, self._of_all.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
-        at, _, distance = project(of, x[point], nodal[which], np.full((len(point), 2), 1 / 3))
+            return nearest, Y, apart
+        surface = Cells(self._element, self._of_all.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
+        foot, _, distance = project(surface, x[point], nodal[which], np.full((len(point), 2), 1 / 3))
         order = np.lexsort((cells[which], np.round(distance, 12), point))  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        found[point[best]], Y[point[best]], apart[point[best]] = cells[which[best]], at[best], distance[best]
-        return found, Y, apart
+        nearest[point[best]], Y[point[best]], apart[point[best]] = cells[which[best]], foot[best], distance[best]
+        return nearest, Y, apart
 
     def _refuse_apart(self, apart: Array, x: Array, h: float, key: str, joint: Joint) -> None:
         worst = int(apart.argmax()) if len(apart) else -1
-        mine = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
-        far, place = max(self._comm.allgather(mine), key=lambda each: each[0])
+        of_rank = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
+        far, place = max(self._comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0])
         if far > APART * h:
             foot, other = joint.edges
             by = f"by {far:.4g} R" if np.isfinite(far) else "by more than a cell"
@@ -238,14 +233,14 @@ def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple
     return np.array(cells, dtype=np.int64), np.array(ends).reshape(-1, 2, 2)
 
 
-def _angle(tangents: fem.Function, moved: fem.Function, fill: fem.Function) -> Expr:
-    """Sine and cosine of the angle between both normals about the edge."""
+def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> Expr:
+    """Sine and cosine of the angle between both normals about the edge, whose direction is the first two of `along`."""
     a1, a2, b1, b2 = (ufl.as_vector([tangents[3 * i + c] + moved[3 * i + c] for c in range(3)]) for i in range(4))
 
     def unit(v: Expr) -> Expr:
         return v / ufl.sqrt(ufl.dot(v, v))
 
-    n, m, t = unit(ufl.cross(a1, a2)), unit(ufl.cross(b1, b2)), unit(fill[0] * a1 + fill[1] * a2)
+    n, m, t = unit(ufl.cross(a1, a2)), unit(ufl.cross(b1, b2)), unit(along[0] * a1 + along[1] * a2)
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
@@ -253,9 +248,9 @@ def tees(model: "ShellModel") -> list[Tee]:
     """The T-junctions of a model; collective."""
     joints, surface = model.loads.joints, model.midsurface
     pairs = enumerate(zip(joints, surface.joints, strict=True))
-    found = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
-    found += [(Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items()]
-    if not found:
+    tied = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
+    tied += [(Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items()]
+    if not tied:
         return []
     cells = model.V.mesh.topology.index_map(2)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
@@ -276,5 +271,5 @@ def tees(model: "ShellModel") -> list[Tee]:
             model.material,
             model.kernels,
         )
-        for joint, key, on in found
+        for joint, key, on in tied
     ]

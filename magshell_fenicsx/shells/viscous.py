@@ -326,7 +326,7 @@ def _works(model: ShellModel | MeridianModel, given: _Given | _Rates) -> list[uf
     up = kin.inverse_metric(r0)
     own = law(r0)
     stretching, bending = work(own.stress(strain, up), E), work(own.moment(strain, bend, up), K)
-    coupled = work(own.moment(E, 0 * K, up), bend)  # of plies: what a viscous bend pulls
+    coupled = work(own.moment(E, 0 * K, up), bend)  # of plies: a viscous bend makes membrane stress
     works = [(stretching + bending + coupled) * kin.area_ratio(r0) * carrier.dx()]
 
     sides = ("+", "-")

@@ -97,8 +97,8 @@ def departed(stage: Stage, found: Record, scale: float) -> Departure:
             phi = critical_mode(stage.newton, state).vector
         except NoEigenpair as e:
             raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
-        there = found.point
-        point = _at(path, state, phi, there.negative_pivots, there.error, there.load_error)
+        excluded = found.point
+        point = _at(path, state, phi, excluded.negative_pivots, excluded.error, excluded.load_error)
         return Departure(stage, path, point, unstable=found.excluded_pivots)
     new = larger(stage.scene, found.mode)
     other = stage.on(new)

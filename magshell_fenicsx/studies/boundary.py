@@ -328,20 +328,20 @@ def _begin(
     except Stopped as e:  # what lies beyond an instability does not matter
         lost = e
     try:
-        found = start.of(records)
+        located = start.of(records)
     except CaseError:
         if lost:
             raise lost from None
         if start.text:
             raise
         return {"label": "", "mode": ""}
-    state = found.point.state
+    state = located.point.state
     outcome = {
-        "label": found.label,
-        "mode": found.mode,
-        "amplitude": found.amplitude,
-        "step": found.step,
-        "value": state.mu[found.amplitude],
+        "label": located.label,
+        "mode": located.mode,
+        "amplitude": located.amplitude,
+        "step": located.step,
+        "value": state.mu[located.amplitude],
         "u": _text(state.u),
         "mu": state.mu,
         "factorisations": scene.newton.factorisation.count,

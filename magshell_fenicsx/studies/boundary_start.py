@@ -26,11 +26,11 @@ class Start:
     Attributes
     ----------
     text
-        As it is given; "" for the first one in the last step.
+        DIR:POINT as it is given; "" for the first instability of the last step.
     point
         Its number in the history; -1 without one.
     load
-        There.
+        At the point, as in its column of path.csv.
     """
 
     text: str = ""
@@ -89,8 +89,8 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
         raise CaseError(f"--from {text}: {folder} has no run")
     located: dict[Any, Any] = {row["point"]: row for row in rows if row["label"] in LOCATED}
     if point not in located:
-        there = ", ".join(f"{number} ({row['label']})" for number, row in located.items()) or "none"
-        raise CaseError(f"--from {text}: is no fold or bifurcation of this run; these are {there}")
+        numbers = ", ".join(f"{number} ({row['label']})" for number, row in located.items()) or "none"
+        raise CaseError(f"--from {text}: is no fold or bifurcation of this run; these are {numbers}")
     row = located[point]
     load = float(row[amplitude(row["amplitude"]).column])
     return Start(text, point, load), replace(source, data=data, places={})

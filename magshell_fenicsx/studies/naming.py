@@ -33,7 +33,7 @@ def key_words(key: str, unit: str = "") -> str:
         return "amplitude over $h$"
     *_, parent, last = ("", *key.split("."))
     words = f"{parent} {last}" if last == "flux_density" or last.isdigit() else name
-    words = re.sub(r"^position ([012])$", lambda found: f"position {'xyz'[int(found[1])]}", words)
+    words = re.sub(r"^position ([012])$", lambda axis: f"position {'xyz'[int(axis[1])]}", words)
     step = re.match(r"loading\.(\d+)\.", key)
     return words.replace("_", " ") + (f" of step {int(step[1]) + 1}" if step else "")
 
@@ -79,13 +79,13 @@ def result_words(result: str) -> str:
         return "mean square distance over $R^2$"
     if result == "knockdown":
         return r"knockdown factor  $k_\mathrm{d}$"
-    if found := re.fullmatch(r"omega2_(\d+)", result):
-        return rf"$\omega_{{{found[1]}}}^2 \rho R^2/E$"
-    if found := re.fullmatch(r"hertz_(\d+)", result):
-        return f"frequency {found[1]}"
+    if number := re.fullmatch(r"omega2_(\d+)", result):
+        return rf"$\omega_{{{number[1]}}}^2 \rho R^2/E$"
+    if number := re.fullmatch(r"hertz_(\d+)", result):
+        return f"frequency {number[1]}"
     result = given[0] if (given := split_unit(result)) else result
-    if found := re.fullmatch(r"(.+)_([fum])([xyz])", result):
-        return f"${found[2]}_{found[3]}$ of {found[1].replace('_', ' ')}"
+    if component := re.fullmatch(r"(.+)_([fum])([xyz])", result):
+        return f"${component[2]}_{component[3]}$ of {component[1].replace('_', ' ')}"
     return result.replace("_", " ")
 
 

@@ -99,10 +99,10 @@ class _Site:
         ]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
-        """(entities, functions, functions) the nodes of the rows and of the columns of what an entity couples."""
-        here = np.hstack([nodes[cells] for cells in self._batch.cells])
-        both = np.broadcast_arrays(here[:, :, None], here[:, None])
-        return both[0], both[1]
+        """Nodes of the rows and nodes of the columns of each entity's matrix, both (entities, functions, functions)."""
+        of_entities = np.hstack([nodes[cells] for cells in self._batch.cells])
+        rows, columns = np.broadcast_arrays(of_entities[:, :, None], of_entities[:, None])
+        return rows, columns
 
     def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
         """(waves, entities, pairs of components, pairs of functions), see `_UPPER`; None if no energy is there."""
@@ -121,10 +121,10 @@ class _Site:
                 factor = np.pi * factors[self._energies[number].amplitude]
                 upper[which] += factor * self._points.evaluate(self._kernels[number], self._batch.size)
         upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
-        some = upper.any(axis=(0, 2))  # a body touches few cells
+        stiff = upper.any(axis=(0, 2))  # a body touches few cells: the matrices of others are zero
         whole = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
-        ordered = upper[:, some][..., self._order].reshape(-1, len(self._products))  # one large product
-        whole[:, some] = (ordered @ self._products).reshape(len(waves), -1, *whole.shape[2:])
+        ordered = upper[:, stiff][..., self._order].reshape(-1, len(self._products))
+        whole[:, stiff] = (ordered @ self._products).reshape(len(waves), -1, *whole.shape[2:])
         return whole
 
     def _place(self) -> None:
@@ -242,14 +242,16 @@ def _added(
 
 
 def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_array:
-    """The matrix (entries of all pairs of nodes, entries of a site's blocks) that sums these.
+    """The sparse matrix (entries of all pairs of nodes, entries of a site's blocks) by which the blocks are added up.
 
     Parameters
     ----------
     numbers
-        (entities, functions, functions) of the pairs of nodes, where these are `kept`.
+        (entities, functions, functions) of the pairs of nodes.
+    kept
+        (entities, functions, functions) whether a pair is in the triangle that is assembled.
     count
-        Of all pairs.
+        Number of all pairs.
     """
     entries = np.arange(numbers.size * len(_UPPER)).reshape(len(numbers), len(_UPPER), *numbers.shape[1:])
     rows, columns = list[Ints](), list[Ints]()

@@ -61,7 +61,7 @@ def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Form
 
 
 def law_at(law: Law, r0: Jet) -> Law:
-    """That of a place: of directions."""
+    """The law at a place, where that of plies has a direction."""
     return law.at(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
 
 

@@ -48,7 +48,7 @@ class TangentSite(Protocol):
 
 
 class FastTangent:
-    """The tangent of a sum of terms; a `assembly.terms.TangentAssembler`.
+    """The tangent of a sum of terms; an `assembly.terms.TangentAssembler`.
 
     Parameters
     ----------

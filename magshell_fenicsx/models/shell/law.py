@@ -69,7 +69,7 @@ class Law(ABC):
         return replace(self, t=factor * self.t)
 
     def made_of(self, e: Scalar, nu: Scalar) -> Self:
-        """That of a shell whose Young's modulus is so many times as large, and with its own nu where a law has one."""
+        """The law with Young's modulus times e, and with another Poisson's ratio where the law has one."""
         return replace(self, e=e * self.e)
 
     @property
@@ -185,7 +185,7 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
 
 
 def lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """The covector with these components with index up."""
+    """The components with index down of a covector, from those with index up; `up` is the inverse metric (2, 2)."""
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
     return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
@@ -197,26 +197,27 @@ def work(S: Components, T: Tensor) -> Scalar:
 
 
 def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None) -> Density:
-    """Of a density that takes a `law`, on two sides a pair of laws, that of a law whose numbers are constants.
+    """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
-    `t` is what multiplies the thickness, (1,), None for 1; `made_of` begins with what `Law.made_of` takes.
+    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1. `made_of` (3,) begins with
+    the arguments of `Law.made_of`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
         return value if density.sides == 2 else [value]
 
-    def of(*arguments: Expr, **known: Any) -> Expr:
+    def of(*arguments: Expr, **keywords: Any) -> Expr:
         given, factors, materials = list(arguments), [1] * density.sides, None
         if made_of is not None:
             materials = by_side(given.pop())
         if t is not None:
-            factors = [each[0] for each in by_side(given.pop())]
+            factors = [factor[0] for factor in by_side(given.pop())]
         count = len(given) - len(law.numbers)
-        laws = [law.with_numbers(*given[count:]).thicker(each) for each in factors]
+        laws = [law.with_numbers(*given[count:]).thicker(factor) for factor in factors]
         if materials is not None:
-            laws = [each.made_of(own[0], own[1]) for each, own in zip(laws, materials, strict=True)]
-        return density.of(*given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **known)
+            laws = [of_side.made_of(own[0], own[1]) for of_side, own in zip(laws, materials, strict=True)]
+        return density.of(*given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords)
 
-    fields = (each for each in (t, made_of) if each is not None)
+    fields = (field for field in (t, made_of) if field is not None)
     parameters = (*density.parameters, *law.numbers, *fields)
     return replace(density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still)

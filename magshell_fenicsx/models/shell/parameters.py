@@ -28,7 +28,7 @@ Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] 
 
 @dataclass(frozen=True)
 class OwnMaterial:
-    """Of one shell of several: Young's modulus over that of the first one, nu, and the density over that of the first.
+    """The material of one of several shells: modulus and density over those of the first shell, and Poisson's ratio.
 
     >>> OwnMaterial(2.0, 0.3).numbers
     (2.0, 0.3, 1.0)
@@ -40,7 +40,7 @@ class OwnMaterial:
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """All."""
+        """`modulus`, `nu` and `density`, the components of `thickness.material_field`."""
         return self.modulus, self.nu, self.density
 
 

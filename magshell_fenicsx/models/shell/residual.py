@@ -40,7 +40,7 @@ class _Site(Protocol):
 
 
 class FastResidual:
-    """The residual of a sum of terms; a `assembly.terms.ResidualAssembler`.
+    """The residual of a sum of terms; an `assembly.terms.ResidualAssembler`.
 
     Terms on cells that share an amplitude also share a kernel: their geometry is found once.
 

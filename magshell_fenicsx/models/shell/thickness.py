@@ -116,7 +116,10 @@ def thickness_field(
 def material_field(
     shells: Mapping[str, OwnMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
 ) -> fem.Function:
-    """Modulus over that of the first shell, nu and density over that of the first, in each cell; shape (3,)."""
+    """`OwnMaterial.numbers` of each cell; shape (3,).
+
+    `patches` tell for each cell of this rank, ghosts too, whether it belongs to a shell.
+    """
     Q = fem.functionspace(domain, ("DG", 0, (3,)))
     field = fem.Function(Q, name="material")
     values = field.x.array.reshape(-1, 3)
@@ -160,7 +163,7 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "lo
 
 
 def thick(density: Density, t: fem.Function, component: int = 0) -> Density:
-    """A density per E h where the thickness is h t, or another component of t multiplies it."""
+    """A density per E h times a component of the field t; its first is by default the thickness over h."""
 
     def of(*arguments: Expr) -> Expr:
         *given, factor = arguments

@@ -84,7 +84,7 @@ def animated(
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
     palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
     first, *others = (
-        _in_palette(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither)) for frame in frames
+        _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither)) for frame in frames
     )
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
@@ -93,14 +93,14 @@ def animated(
     return content.getvalue()
 
 
-def _in_palette(frame: Image, found: "Pillow.Image") -> "Pillow.Image":
-    """The colours that were found, and white where a frame is white: Pillow takes a neighbour of white too."""
+def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
+    """A frame in the colours of a palette, white where it is white: Pillow takes a neighbour of white there."""
     from PIL import Image as Pillow
 
-    numbers = np.asarray(found).copy()
+    numbers = np.asarray(reduced).copy()
     numbers[(frame == WHITE[0]).all(axis=-1)] = 0
     white = Pillow.fromarray(numbers, "P")
-    white.putpalette(found.getpalette() or [])
+    white.putpalette(reduced.getpalette() or [])
     return white
 
 

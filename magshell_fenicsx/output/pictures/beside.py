@@ -38,12 +38,12 @@ class Laid:
 
     def on(self, under: Image) -> Image:
         """An image with it in front."""
-        laid, here = under.copy(), self.part > 0
-        over, back = self.part[here], under[here]
+        laid, covered = under.copy(), self.part > 0
+        over, back = self.part[covered], under[covered]
         below = back[:, 3] / 255 * (1 - over)
         alpha = over + below
-        colours = (over[:, None] * self.image[here, :3] + below[:, None] * back[:, :3]) / alpha[:, None]
-        laid[here] = np.rint(np.column_stack([colours, 255 * alpha]))
+        colours = (over[:, None] * self.image[covered, :3] + below[:, None] * back[:, :3]) / alpha[:, None]
+        laid[covered] = np.rint(np.column_stack([colours, 255 * alpha]))
         return laid
 
 

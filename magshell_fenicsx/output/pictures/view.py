@@ -210,10 +210,10 @@ class InView:
 
     @cached_property
     def _lit(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Cosines between normals and the ways to the eye and the lamp, at points, and that of a place in full light.
+        """At points the cosines between normals and the ways to the eye and to the lamp, and the cosine of full light.
 
-        In full light is what faces the eye, or if nothing faces the lamp as well as that, what faces it best: a plate
-        that is seen from its dark side has the colours of the bar too.
+        Full light has what faces the eye. If nothing faces the lamp as well as that, what faces it best has full light:
+        so a plate that is turned away from the lamp has the colours of the bar too.
         """
         normals, lamp = self.camera(self._pieces.normals(self._r)), np.array(LAMP) / np.linalg.norm(LAMP)
         eye, to_lamp = (np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp))

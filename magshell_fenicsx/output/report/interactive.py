@@ -177,18 +177,18 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     """The numbers of path.csv that vary, names of columns, and the lines of the curve of each step."""
     varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
     parts = _parts(rows, varied) if varied else []
-    known = _known(rows[0])
+    quantities = _quantities(rows[0])
     first = list[str]()
     for part in reversed(parts):  # its words say whose displacement it is
-        known |= {q.name: q for q in axes_for(part)}
+        quantities |= {q.name: q for q in axes_for(part)}
         first += [q.name for q in axes_for(part)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
     varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
     columns = {}
     for name in dict.fromkeys([*first, *varying]):
-        it = known.get(name) or quantity(name)
+        shown = quantities.get(name) or quantity(name)
         values = [row[name] for row in rows]
-        columns[name] = {"label": label(it, rows[0], pole), "values": values, "sign": it.sign}
+        columns[name] = {"label": label(shown, rows[0], pole), "values": values, "sign": shown.sign}
     return {
         "columns": columns,
         "steps": [_step(part, rows) for part in parts],
@@ -199,19 +199,19 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     }
 
 
-def _known(names: Iterable[str]) -> dict[str, Quantity]:
-    """Column -> its quantity: one in units comes after its own and has its words.
+def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
+    """Column -> its quantity; a column in units has the words of that without units.
 
     Examples
     --------
-    >>> _known(["w_over_h", "w_mm"])["w_mm"].label
+    >>> _quantities(["w_over_h", "w_mm"])["w_mm"].label
     'displacement  $w$  (mm)'
     """
-    known = dict[str, Quantity]()
-    for of in map(quantity, names):
-        for each in (of, *of.in_units):
-            known.setdefault(each.name, each)
-    return known
+    by_column = dict[str, Quantity]()
+    for plain in map(quantity, names):
+        for shown in (plain, *plain.in_units):
+            by_column.setdefault(shown.name, shown)
+    return by_column
 
 
 def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:

@@ -85,9 +85,8 @@ class Kind:
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
         t = self._shape.thickness(self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape)))[0]
-        t, q = (
-            np.concatenate([c * each for c in of]) for each, of in ((t, self._copies.up), (q, self._copies.charges))
-        )
+        t = np.concatenate([side * t for side in self._copies.up])
+        q = np.concatenate([factor * q for factor in self._copies.charges])
         return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t, q)
 
 
@@ -99,7 +98,7 @@ class Charged:
     shape
         All cells that are modelled.
     parts
-        (copies cells,) the number of each one's part.
+        (copies * cells,) the number of each one's part.
     cells, edges
         Edges that may be charged, by cell and local number.
     near
@@ -127,7 +126,7 @@ class Charged:
             self._apart[cell, others] = 0
 
     def rules(self, nodes: Array, own: range) -> NDArray[np.int8]:
-        """(own, cells) the number in `DEGREES` of the rule of each pair of cells; -1 of those that have none here.
+        """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that has none here.
 
         Raises
         ------
@@ -136,10 +135,10 @@ class Charged:
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
         apart = np.ascontiguousarray(self._apart[own.start : own.stop])
-        found = self._pairs.rules(nodes, own, apart, least, self._h, SPACE, ABOVE, worst)
-        if found is None:
+        rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, worst=worst)
+        if rules is None:
             raise Touching
-        return np.asarray(found)
+        return rules
 
     def evaluate(self, nodes: Array, own: range, stiffness: Stiffness | None = None) -> tuple[float, Array]:
         """The energy of the pairs that own cells are in, each half, and its gradient (own, k, 3) by their nodes.
@@ -147,7 +146,7 @@ class Charged:
         Parameters
         ----------
         nodes
-            (copies cells, k, 3) the deformed ones; own cells are among the first copy.
+            (copies * cells, k, 3) the deformed ones; own cells are among the first copy.
         stiffness
             Gets the second derivatives by the nodes of own cells and those of all cells.
 
@@ -159,17 +158,17 @@ class Charged:
         rules, gradient, energy = self.rules(nodes, own), np.zeros_like(nodes), 0.0
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own.start
-        here = (second >= own.start) & (second < own.stop)
-        for number, (among, part) in product(np.unique(which), ((here & (first < second), 1.0), (~here, 0.5))):
-            some = among & (which == number)
-            both = np.column_stack([first[some], second[some]])
+        both_own = (second >= own.start) & (second < own.stop)  # such a pair stands in both orders
+        shares = (both_own & (first < second), 1.0), (~both_own, 0.5)
+        for number, (counted, share) in product(np.unique(which), shares):
+            chosen = counted & (which == number)
+            cells = np.column_stack([first[chosen], second[chosen]])
             for one, other in product(self._kinds, self._kinds):
-                rows = one.number[both[:, 0]], other.number[both[:, 1]]
-                there = (rows[0] >= 0) & (rows[1] >= 0)
-                left, right = (
-                    (kind.rule(int(number)), row[there]) for kind, row in zip((one, other), rows, strict=True)
-                )
-                energy += part * self._pairs.add(nodes, both[there], int(there.sum()), left, right, gradient, stiffness)
+                one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
+                charged = (one_row >= 0) & (other_row >= 0)
+                left, right = (one.rule(int(number)), one_row[charged]), (other.rule(int(number)), other_row[charged])
+                count = int(charged.sum())
+                energy += share * self._pairs.add(nodes, cells[charged], count, left, right, gradient, stiffness)
         for number, kind in product(np.unique(which), self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:

@@ -133,8 +133,8 @@ class MagneticSection(Section, Ability):
     """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in proportion to the field.
     It needs a susceptibility and flux densities"""
     interaction: Literal["none", "others", "all"] = "none"
-    """Whether parts of the shell that are not connected, those of a mesh file, act on each other with their own fields
-    (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs
+    """Whether parts that are not connected, several shells or those of a mesh file, act on each other with their own
+    fields (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs
     remanent.flux_density and shell.youngs_modulus"""
     remanent: RemanentSection | None = RemanentSection.model_construct()
     """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""

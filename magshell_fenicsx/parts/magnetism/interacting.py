@@ -37,7 +37,7 @@ class InteractionTerm:
     Raises
     ------
     CaseError
-        If the shell is one part, or the model is too large.
+        If the model is too large.
     """
 
     group, column = "magnetic", "magnetic"
@@ -60,7 +60,7 @@ class InteractionTerm:
         self._seen: tuple[Array, float, Array] | None = None
 
     def antisymmetric(self) -> "InteractionTerm":
-        """The term for displacements that are opposite in the images, added to symmetric ones."""
+        """The same term for additions to u that are opposite in the images."""
         other = copy(self)
         other._odd = True
         return other
@@ -73,21 +73,21 @@ class InteractionTerm:
         CaseError
             On every rank, if they are not.
         """
-        near = False
         if not self._itself and self._parts.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between shells that no joint connects, or parts of a mesh file, "
                 "and here all is one part: take interaction: all"
             )
+        near = False
         try:
-            nodes = self._nodes()
+            nodes = self._nodes()  # first: the charges are made of what it gathers
             self._charged.rules(nodes, self._cells.own)
         except Touching:
             near = True
         if self._comm.allreduce(near, MPI.LOR):
             raise CaseError(
-                "magnetic.interaction: others: undeformed, two parts are nearer to each other than their thickness, or "
-                "than a seventh of the size of their cells: move them apart, or take smaller cells in the mesh file"
+                "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or "
+                "than a seventh of the size of their cells: move them apart, or take smaller cells"
             )
 
     def energy(self) -> float:
@@ -134,7 +134,7 @@ class InteractionTerm:
         return self._seen[1:]
 
     def _nodes(self) -> Array:
-        """(copies cells, k, 3) the deformed nodes of all cells; what is charged is renewed where it has changed."""
+        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if shape or remanence changed."""
         r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
@@ -177,27 +177,26 @@ class InteractionTerm:
 
     @cached_property
     def _corners(self) -> Ints:
-        """(copies cells, 3) numbers of corners: one where an image is another one, on a mirror plane; collective."""
+        """(copies * cells, 3) numbers of corners; on a mirror plane an image has that of its original; collective."""
         r0, corners = whole(self._model.r0), self._cells.nodes[:, :3]
         places = self._copies.of(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
-        for copy_, x in enumerate(places):
-            for before in range(copy_):
-                same = np.abs(x - places[before]).max(axis=1) < SAME
-                numbers[copy_][same] = numbers[before][same]
-        return np.concatenate([each[corners] for each in numbers])
+        for later, x in enumerate(places):
+            for earlier in range(later):
+                same = np.abs(x - places[earlier]).max(axis=1) < SAME
+                numbers[later][same] = numbers[earlier][same]
+        return np.concatenate([of_copy[corners] for of_copy in numbers])
 
     @cached_property
     def _parts(self) -> Ints:
-        """(copies cells,) the part of each cell; collective."""
-        V, corners, several = self._u.function_space, self._corners, self._copies.images[1:]
-        if not several:
+        """(copies * cells,) the part of each cell; collective."""
+        V, corners = self._u.function_space, self._corners
+        if len(self._copies.images) == 1:
             return np.asarray(self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
         graph = coo_array((ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size))
-        return np.asarray(
-            np.unique(connected_components(graph, directed=False)[1][corners[:, 0]], return_inverse=True)[1]
-        )
+        _, part_of_corner = connected_components(graph, directed=False)
+        return np.asarray(np.unique(part_of_corner[corners[:, 0]], return_inverse=True)[1])
 
     @property
     def _sight(self) -> Sight:

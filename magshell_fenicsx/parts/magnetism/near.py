@@ -93,7 +93,7 @@ class Near:
     shape
         All cells that are modelled.
     corners
-        (copies cells, 3) numbers of the corners of all copies.
+        (copies * cells, 3) numbers of the corners of all copies.
     cells, edges
         Edges that may be charged, by cell and local number.
     own
@@ -137,13 +137,13 @@ class Near:
     def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
         """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added, right for own cells."""
         energy = 0.0
-        for each in self._batches:
-            every = np.arange(len(each.pairs))
-            left, right = (each.left, every), (each.right, every)
-            energy += self._pairs.add(nodes, each.pairs, each.own, left, right, gradient, stiffness)
-            self._pairs.finish(nodes, each.pairs[:, 0], each.left, gradient, stiffness)
-            if each.right.tables.ndim == 3:
-                self._pairs.finish(nodes, each.pairs[:, 1], each.right, gradient, stiffness)
+        for batch in self._batches:
+            rows = np.arange(len(batch.pairs))
+            left, right = (batch.left, rows), (batch.right, rows)
+            energy += self._pairs.add(nodes, batch.pairs, batch.own, left, right, gradient, stiffness)
+            self._pairs.finish(nodes, batch.pairs[:, 0], batch.left, gradient, stiffness)
+            if batch.right.tables.ndim == 3:
+                self._pairs.finish(nodes, batch.pairs[:, 1], batch.right, gradient, stiffness)
         return energy
 
     def _at_boundary(self) -> NDArray[np.bool_]:
@@ -208,8 +208,8 @@ class Near:
     def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
         first, second, same = self._rules(kind)
         on_strips = kind[0] == "strips"
-        left = self._found(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
-        right = self._found(pairs[:, 1], second, kind[3] if on_strips else None)
+        left = self._points(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
+        right = self._points(pairs[:, 1], second, kind[3] if on_strips else None)
         T, h, t, q = right
         if not same:
             count = len(first.weights)
@@ -255,7 +255,7 @@ class Near:
         w = [np.concatenate([w, np.zeros(longest - len(w))]) for _, w in rules]
         return Places(np.concatenate(X), np.concatenate(w))
 
-    def _found(self, cells: Ints, points: Places, edge: int | None) -> tuple[Array, Array, Array, Array]:
+    def _points(self, cells: Ints, points: Places, edge: int | None) -> tuple[Array, Array, Array, Array]:
         """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
@@ -286,13 +286,13 @@ class Near:
         """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
         (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
         at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
-        found: list[Array] = [np.zeros((len(self._shape.r0), len(at))) for _ in range(3)]
-        for edge, into in enumerate(found):
+        charges: list[Array] = [np.zeros((len(self._shape.r0), len(at))) for _ in range(3)]
+        for edge, of_edge in enumerate(charges):
             cells = np.flatnonzero(self._strips[: len(self._shape.r0), edge])
             if len(cells):
                 sides = Sides(self._shape, cells, np.full(len(cells), edge))
-                into[cells] = sides.at(Boxes.whole(len(cells)), at, np.ones(len(at))).q[..., 0]
-        return found
+                of_edge[cells] = sides.at(Boxes.whole(len(cells)), at, np.ones(len(at))).q[..., 0]
+        return charges
 
 
 def _lagrange(n: int, x: Array) -> Array:

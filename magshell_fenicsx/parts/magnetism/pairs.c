@@ -23,7 +23,7 @@ typedef struct {
     v t;
 } Point;
 
-static const int AT[3][3] = {{0, 3, 4}, {3, 1, 5}, {4, 5, 2}};
+static const int AT[3][3] = {{0, 3, 4}, {3, 1, 5}, {4, 5, 2}}; /* of entry (i, j) among xx, yy, zz, xy, xz, yz */
 
 /* 1/sqrt(x): two steps of Householder's method, of third order, from the halved exponent. */
 INLINE void inverse_root(const v *x, v *y)
@@ -120,9 +120,9 @@ INLINE void gather(const double *x, int64_t step, const int64_t *at, v *y)
         (*y)[c] = x[step * at[c]];
 }
 
-/* The energy of the charges q (L,) at one point and p (S,) at another, at heights hL and hR over the thickness; the derivatives of
-   both are added up, and if `bent` the second ones, too. X (4, 6) gets those by both places, and their moments by the
-   left height, the right one, and both. */
+/* The energy of the charges q (L,) at one point and p (S,) at another, at heights hL and hR over the thickness. The
+   derivatives by both points are added to these; with `bent` the second ones too. X (4, 6) gets the second derivatives
+   by one place and the other, and their moments by the left height, the right one, and both. */
 INLINE void between(int64_t L, int64_t S, int bent, Point *left, const v *q, const double *hL, Point *right, const v *p,
                     const double *hR, v *energy, v *X)
 {

@@ -1,4 +1,4 @@
-"""Sums over pairs of charged cells in C: energy, gradient and second derivatives, `LANES` pairs at once."""
+"""Sums over pairs of charged cells, in C: energy, gradient and second derivatives, `LANES` pairs at once."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,7 +45,7 @@ class Copies:
 
     @property
     def up(self) -> Array:
-        """(copies,) the side of the mid-surface, as cross products of a copy see it, on which height is positive."""
+        """(copies,) 1, or -1 where an image turns normals over, so that its heights have the other sign."""
         return np.array([image.sign for image in self.images])
 
     @property
@@ -54,7 +54,7 @@ class Copies:
         return np.where(self.up < 0, self.charge, 1.0)
 
     def of(self, nodes: Array) -> Array:
-        """The nodes (copies cells, k, 3) of all."""
+        """The nodes (copies * cells, k, 3) of all."""
         return np.concatenate([image.of(nodes) for image in self.images])
 
 
@@ -94,18 +94,18 @@ class Points:
 
 
 class Stiffness:
-    """Second derivatives: those by the nodes of one cell, summed, and rows of a matrix.
+    """Second derivatives, added to rows of a matrix; those by the nodes of one cell are first summed for each cell.
 
     Parameters
     ----------
     rows
         (local nodes, 3, all nodes, 3), added to.
     factor
-        What they are multiplied by.
+        Of all second derivatives.
     row_of, column_of
         (cells, k) numbers of nodes; rows of other ranks and of images are -1.
     turn
-        (copies, 3, 3) what takes a change of the modelled nodes to that of the copy's.
+        (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
     """
 
     def __init__(self, rows: Array, factor: float, row_of: Ints, column_of: Ints, turn: Array) -> None:
@@ -115,12 +115,11 @@ class Stiffness:
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
 
     def finish(self) -> None:
-        """Add what each cell has with itself."""
+        """Add the second derivatives by the nodes of one cell."""
         k = self.row_of.shape[1]
         a, b = np.triu_indices(k)
-        own = np.flatnonzero(self.row_of[:, 0] >= 0)
         block = np.zeros((k, k, 3, 3))
-        for cell in own:
+        for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
             onto = self.factor * self.onto[cell]
             block[b, a], block[a, b] = onto.transpose(0, 2, 1), onto
             at = self.row_of[cell][:, None], slice(None), self.column_of[cell][None], slice(None)
@@ -143,7 +142,7 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """The energy of the first pairs of cells (n, 2); the gradient (cells, k, 3) and the stiffness of all are added.
+        """The energy of the first `counted` pairs (n, 2) of cells; gradient (cells, k, 3) and stiffness get all pairs.
 
         What they add at points that stay on their elements is in the sums of these: see `finish`.
 
@@ -155,62 +154,76 @@ class Pairs:
         if not len(cells):
             return 0.0
         idle = -len(cells) % LANES
-        both, first, second = (_filled(each, idle) for each in (cells, left[1], right[1]))
+        both, left_rows, right_rows = (_filled(rows, idle) for rows in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        into = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL, self._ffi.NULL, 1]
+        matrix = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL, self._ffi.NULL, 1]
         if stiffness:
             onto, rows, width = stiffness.onto, stiffness.rows, stiffness.rows.shape[2]
             turn, modelled = stiffness.turn, len(nodes) // len(stiffness.turn)
-            into = [p(onto), p(rows), width, p(stiffness.row_of), p(stiffness.column_of), p(turn), modelled]
-        one, other = ([p(each.tables), p(each.heights), p(each.t), p(each.q)] for each in (left[0], right[0]))
+            matrix = [p(onto), p(rows), width, p(stiffness.row_of), p(stiffness.column_of), p(turn), modelled]
+        on_left, on_right = ([p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0]))
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
         factor = stiffness.factor if stiffness else 0.0
         sums = p(right[0].sums) if same else self._ffi.NULL
-        seen = [P, L, *one, p(left[0].sums), p(first), M, S, *other, sums, p(second), int(same), p(gradient), factor]
-        return float(self._lib.pairs(*sizes, *seen, *into))
+        points = [P, L, *on_left, p(left[0].sums), p(left_rows), M, S, *on_right, sums, p(right_rows), int(same)]
+        return float(self._lib.pairs(*sizes, *points, p(gradient), factor, *matrix))
 
     def finish(
-        self, nodes: Array, cells: Ints, of: "Points", gradient: Array, stiffness: Stiffness | None = None
+        self, nodes: Array, cells: Ints, points: "Points", gradient: Array, stiffness: Stiffness | None = None
     ) -> None:
-        """Add the sums at points on elements in cells (rows,), which are zero again."""
+        """Add the sums at points of elements in cells (rows,) to gradient and stiffness, and make them zero."""
         idle, p = -len(cells) % LANES, self._pointer
-        every = _filled(cells, idle)
+        filled, (P, *_) = _filled(cells, idle), points.tables.shape
         onto = p(stiffness.onto) if stiffness else self._ffi.NULL
-        given = [len(every), idle, p(every), nodes.shape[1], p(nodes), of.tables.shape[0], p(of.tables), p(of.sums)]
-        self._lib.points(*given, p(gradient), onto)
-        of.sums[:] = 0.0
+        sizes = [len(filled), idle, p(filled), nodes.shape[1], p(nodes), P]
+        self._lib.points(*sizes, p(points.tables), p(points.sums), p(gradient), onto)
+        points.sums[:] = 0.0
 
-    def rules(self, nodes: Array, own: range, apart: NDArray[np.uint8], least: Array, *numbers: float) -> Any:
-        """See pairs.c; None if two cells are too near each other."""
+    def rules(
+        self,
+        nodes: Array,
+        own: range,
+        apart: NDArray[np.uint8],
+        least: Array,
+        *,
+        h: float,
+        space: float,
+        above: float,
+        worst: float,
+    ) -> NDArray[np.int8] | None:
+        """(own, cells) the number of the rule of each pair, -1 without one; None if two cells are too near each other.
+
+        Parameters
+        ----------
+        apart
+            (own, cells) 1 for the pairs that have a rule.
+        least
+            (rules,) the distance over the size of cells from which each rule is precise.
+        h
+            Of the shell, over R: nearer cells are too near.
+        space
+            Least distance over size that is counted.
+        above
+            Part of a cell's radius: what is so near to its middle is above or below the cell.
+        worst
+            As `least`, of the rule beyond the last: cells below it are too near.
+        """
         centre = nodes.mean(axis=1)
         normal = np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         radius = np.linalg.norm(nodes - centre[:, None], axis=-1).max(axis=1)
-        (h, space, above, worst), p = numbers, self._pointer
-        found = np.empty((len(own), len(nodes)), dtype=np.int8)
-        given = [p(each) for each in (nodes, centre, normal, radius, apart)]
-        failed = self._lib.rules(
-            len(nodes),
-            own.start,
-            own.stop,
-            nodes.shape[1],
-            *given,
-            h,
-            space,
-            above,
-            len(least),
-            p(least),
-            worst,
-            p(found),
-        )
-        return None if failed else found
+        p, chosen = self._pointer, np.empty((len(own), len(nodes)), dtype=np.int8)
+        sizes = [len(nodes), own.start, own.stop, nodes.shape[1]]
+        arrays = [p(array) for array in (nodes, centre, normal, radius, apart)]
+        too_near = self._lib.rules(*sizes, *arrays, h, space, above, len(least), p(least), worst, p(chosen))
+        return None if too_near else chosen
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
         return self._ffi.from_buffer(KINDS[array.dtype.name], array)
 
 
-def _filled(each: Ints, idle: int) -> Ints:
-    """Rows with some more of the last one."""
-    return np.concatenate([each, each[-1:].repeat(idle, 0)])
+def _filled(rows: Ints, idle: int) -> Ints:
+    """The rows, and the last one `idle` times more."""
+    return np.concatenate([rows, rows[-1:].repeat(idle, 0)])

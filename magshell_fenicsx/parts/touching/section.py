@@ -112,7 +112,7 @@ def pairs(
 
 
 def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
-    """Those of the shells that are part of what is named, or of which it is a patch."""
+    """The values of all shells, of the shell with this name, or of the shell that has this patch."""
     return [value for shell, value in values.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
 
 

@@ -309,7 +309,7 @@ WRONG = [
     ({"remanent": {"polar": 0}, "lambda_m": 1e-3}, {}, "how strong it is follows from remanent.flux_density"),
     ({"remanent": REMANENT}, {"loading": [{"kind": "pressure"}]}, "no step of the programme drives it"),
     ({"remanent": REMANENT}, {"model": "solid"}, "geometry: mesh|needs a mid-surface"),
-    ({"remanent": REMANENT}, {}, "the shell is one part"),
+    ({"remanent": REMANENT}, {}, "here all is one part"),
 ]
 
 

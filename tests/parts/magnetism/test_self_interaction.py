@@ -91,8 +91,7 @@ def test_derivatives(model: Any, tmp_path: Path) -> None:
     energies = [(w, system.at(State(each, mu)).of(term.energy)) for w, each in moved]
     assert sum(w * value for w, value in energies) == pytest.approx(slope @ v, rel=1e-6)
     assert np.abs(slope.reshape(-1, 3).sum(axis=0)).max() < 1e-12 * np.abs(slope).sum()
-    matrix = WholeMatrix(system.u.function_space, system.clamped)
-    rows = system.at(State(u, mu)).of(lambda: matrix.rows([(1.0, term)])).reshape(system.size, -1)
+    rows = rows_of(system, State(u, mu), term)
     change = sum(w * gradient(scene, each) for w, each in moved)
     assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
     assert np.abs(rows - rows.T).max() < 1e-11 * np.abs(rows).max()
@@ -219,4 +218,5 @@ def smooth(x: Array, sign: float) -> Array:
 
 def rows_of(system: Any, state: State, term: Any) -> Array:
     """The interaction's part of the tangent."""
-    return np.asarray(system.at(state).of(lambda: system._whole.rows([(1.0, term)])).reshape(system.size, -1))
+    matrix = WholeMatrix(system.u.function_space, system.clamped)
+    return np.asarray(system.at(state).of(lambda: matrix.rows([(1.0, term)])).reshape(system.size, -1))
