@@ -298,7 +298,7 @@ class OwnTerm:
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(sample, self.densities[0]) for sample in _random_samples()]
+        values = [self._value(sample, density) for density in self.densities for sample in _random_samples()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume

@@ -112,6 +112,15 @@ def test_symmetry_of_what_is_observed(name: str) -> None:
     assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
 
 
+def test_another_observed_density_is_another_term() -> None:
+    """A run is resumed with the same columns alone."""
+    one, other = (
+        OwnTerm("own", None, observed={"first": winkler, "second": lambda r0, u, n=n: ufl.dot(u.r, u.r) ** n})
+        for n in (1, 2)
+    )
+    assert one.digest != other.digest
+
+
 def test_whole_value_of_what_is_observed() -> None:
     """A cap under a load along x: the sum of u_y cancels, and that of u_x is the same on the model that is found."""
     shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.05, "poisson_ratio": 0.3, "youngs_modulus": 1.0}
