@@ -17,8 +17,8 @@ from functools import cache
 from pathlib import Path
 
 FORMS = "libffcx_forms_"  # how the names of dolfinx's begin
-COMPILING = "magshell_compiling.lock"  # held together by all who compile
-UNFINISHED = 600  # s after which nobody compiles any more, while somebody compiles something
+COMPILING = "magshell_compiling_"  # how the name of a file begins that a process holds while it compiles
+UNFINISHED = 600  # s after which nobody compiles a form any more
 
 
 class UnsafeCache(RuntimeError):
@@ -75,13 +75,11 @@ def keep(name: str, content: bytes) -> None:
 
 @contextmanager
 def compiling(folder: Path) -> Iterator[None]:
-    """While forms are compiled into a folder; where files cannot be locked, go on.
-
-    The lock ends with the process: what is unfinished while nobody has it was left by one that was killed.
-    """
+    """While forms are compiled into a folder: a file there says so, which a process that is killed leaves unlocked."""
     with ExitStack() as stack:
         with suppress(OSError):
-            fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_SH)
+            mark = stack.enter_context(tempfile.NamedTemporaryFile(dir=folder, prefix=COMPILING))
+            fcntl.flock(mark, fcntl.LOCK_EX)
         yield
 
 
@@ -118,26 +116,47 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
+    late = _begun_by_the_killed(folder)  # first: what is compiled now has not begun then, or is not finished below
     with os.scandir(folder) as files:  # there may be thousands
         there = {file.name: file for file in files if file.name.startswith(FORMS)}
     strange = {name.split(".")[0] for name, file in there.items() if not trusted(file)}
-    unfinished = [file for name, file in there.items() if name.endswith(".c") and f"{name}.cached" not in there]
-    with ExitStack() as stack:
-        late = time.time() - UNFINISHED
+    ready = (folder / name for name in there if name.endswith(".c.cached"))
+    strange |= {file.name.split(".")[0] for file in ready if not file.with_suffix("").exists()}  # FFCx would fail
+    sources = (name for name in there if name.endswith(".c") and f"{name}.cached" not in there)
+    for name in sources:
         with suppress(OSError):
-            if unfinished:
-                fcntl.flock(stack.enter_context((folder / COMPILING).open("w")), fcntl.LOCK_EX | fcntl.LOCK_NB)
-                late = float("inf")
-        with suppress(OSError):
-            strange |= {file.name.split(".")[0] for file in unfinished if file.stat().st_mtime < late}
-        for name in there if strange else ():
-            if name.split(".")[0] in strange:
-                (folder / name).unlink(missing_ok=True)
+            if (folder / f"{name}.cached").exists():  # by now
+                continue
+            written = there[name].stat().st_mtime
+            if written >= late or written < time.time() - UNFINISHED:
+                strange.add(name.split(".")[0])
+    for name in there if strange else ():
+        if name.split(".")[0] in strange:
+            (folder / name).unlink(missing_ok=True)
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():
             if trusted(file):
                 with suppress(FileExistsError):
                     (folder / file.name).symlink_to(file)
+
+
+def _begun_by_the_killed(folder: Path) -> float:
+    """When the first of those began that were killed while they compiled; infinite if none was, or one goes on."""
+    begun = float("inf")
+    left = list[Path]()
+    for mark in folder.glob(f"{COMPILING}*"):
+        try:
+            with mark.open("rb") as held:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                begun = min(begun, mark.stat().st_mtime)
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return float("inf")  # what is unfinished may be theirs
+        left.append(mark)
+    for mark in left:
+        mark.unlink(missing_ok=True)
+    return begun
 
 
 def _candidates(usual: Path) -> Iterator[Path]:

@@ -105,15 +105,39 @@ def test_a_kernel_that_others_may_write(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_form_that_was_never_finished(tmp_path: Path) -> None:
     """A process was killed while it compiled: all others would wait ten minutes for it, and then fail."""
     made, (old, new) = folder(tmp_path / "cache", 0o755), ("libffcx_forms_old.c", "libffcx_forms_new.c")
-    for name in (old, new, "libffcx_forms_whole.c", "libffcx_forms_whole.c.cached"):
+    whole = ["libffcx_forms_whole.c", "libffcx_forms_whole.c.cached"]
+    for name in (old, new, *whole, "libffcx_forms_lost.c.cached"):
         (made / name).touch()
     os.utime(made / old, (1e9, 1e9))
-    whole = ["libffcx_forms_whole.c", "libffcx_forms_whole.c.cached"]
-    with kept.compiling(made):  # somebody does: what is new may be theirs
+
+    def left() -> list[str]:
         kept._prepare(made, ())
-        assert sorted(file.name for file in made.glob("*.c*")) == [new, *whole]
+        return sorted(file.name for file in made.glob("*.c*"))
+
+    assert left() == [new, *whole]  # another program may compile it, which leaves no mark
+    killed = made / f"{kept.COMPILING}killed"
+    killed.touch()
+    (made / new).touch()
+    with kept.compiling(made):  # what is new may be theirs
+        assert left() == [new, *whole]
+    assert left() == whole
+    assert not [*made.glob(f"{kept.COMPILING}*")]
+
+
+def test_a_form_finished_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is whole: only its source would have been taken away, and nobody could compile it again."""
+    made, name = folder(tmp_path / "cache", 0o755), "libffcx_forms_own.c"
+    (made / f"{kept.COMPILING}killed").touch()
+    (made / name).touch()
+
+    def finish(folder: Path) -> float:
+        (made / f"{name}.cached").touch()
+        return begun(folder)
+
+    begun = kept._begun_by_the_killed
+    monkeypatch.setattr(kept, "_begun_by_the_killed", finish)
     kept._prepare(made, ())
-    assert sorted(file.name for file in made.glob("*.c*")) == whole
+    assert sorted(file.name for file in made.glob("*.c*")) == [name, f"{name}.cached"]
 
 
 def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
