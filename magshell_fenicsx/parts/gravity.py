@@ -11,9 +11,9 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.input.section import Finite, over
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.course import Now, Target, Until
+from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -33,7 +33,7 @@ ACCELERATION = Unit(
 )
 
 
-class GravityStep(PathStep):
+class GravityStep(BodyForceStep):
     """The shell's own weight, or that of a steady acceleration: the forces ρ g per volume along a direction.
 
     The weight follows the thickness where this varies, and acts in all of a solid. Steps in different directions have
@@ -48,7 +48,6 @@ class GravityStep(PathStep):
     kind: Literal["gravity"]
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: g, or arc length, which passes its folds"""
-    until: Until = "target"
     direction: list[Finite] = Field(default=[0.0, 0.0, -1.0], min_length=3, max_length=3)
     """Its three components, of any length; by default down e3"""
     acceleration: Annotated[float, over(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
@@ -70,12 +69,6 @@ class GravityStep(PathStep):
         """The unit vector (3,); the square of 1e-200 would be zero."""
         large = np.array(self.direction) / max(map(abs, self.direction))
         return np.asarray(large / np.linalg.norm(large))
-
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if self.target else now.h**2
-
-    def scale(self, now: Now) -> float:
-        return abs(self.acceleration or now.h**2)
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         return [Leaves(vectors=[self._along])]

@@ -84,19 +84,20 @@ class Joined(KeyAbility[Sequence[JointSection]]):
 
     def refuse_unfit(self, context: Context) -> None:
         """See that the edges are of several shells, each joined once, and that all else goes with joints."""
-        if not context.sections.get("shells"):
+        shells = context.sections.get("shells")
+        if not shells:
             raise ValueError("joints: join edges of several shells: give shells")
         context.needs("joints", "a mid-surface", "a material without viscosity")
         taken = set[str]()
         for i, section in enumerate(self.given):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
-            if section.angle is not None and section.edges[1] in (context.sections.get("shells") or {}):
+            if section.angle is not None and section.edges[1] in shells:
                 raise ValueError(
                     f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
                 )
             for name in section.edges:
-                if name in (context.sections.get("shells") or {}):
+                if name in shells:
                     continue  # on which several edges may be
                 if name in taken:
                     raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")

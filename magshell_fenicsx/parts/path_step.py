@@ -209,6 +209,19 @@ class PathStep(Step):
         return 1.0
 
 
+class BodyForceStep(PathStep):
+    """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
+
+    control: Literal["load", "arc"] = "arc"
+    until: Until = "target"
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        return change / self.points if self.target else now.h**2
+
+    def scale(self, now: Now) -> float:
+        return abs(self.target[1]) or now.h**2 if self.target else now.h**2
+
+
 class FactorStep(PathStep):
     """The base of what grows to a factor, 1 by default.
 

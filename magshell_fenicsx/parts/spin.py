@@ -9,9 +9,9 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.input.section import over
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.course import Now, Target, Until
+from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 
@@ -26,7 +26,7 @@ def _of_angles(value: Any) -> Any:
     return value
 
 
-class SpinStep(PathStep):
+class SpinStep(BodyForceStep):
     """The shell spins about e3 through the origin: the forces ρ ω² r away from the axis, where it has moved to.
 
     Points are equal parts of ω²; a `history` in time is of ω itself, over √(E/ρ)/R. Forces of Coriolis are left out:
@@ -41,19 +41,12 @@ class SpinStep(PathStep):
     kind: Literal["spin"]
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: ω², or arc length, which passes its folds"""
-    until: Until = "target"
     speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(default=None, ge=0, le=1e3)
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
 
     @property
     def _given(self) -> dict[str, float]:
         return {} if self.speed is None else {"speed": self.speed**2}
-
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if self.target else now.h**2
-
-    def scale(self, now: Now) -> float:
-        return (self.speed or now.h) ** 2
 
     def of_history(self, value: float) -> float:
         return value**2
