@@ -75,12 +75,26 @@ def keep(name: str, content: bytes) -> None:
 
 @contextmanager
 def compiling(folder: Path) -> Iterator[None]:
-    """While forms are compiled into a folder: a file there says so, which a process that is killed leaves unlocked."""
+    """While forms are compiled into a folder, which is held meanwhile: nothing unfinished is removed from it.
+
+    A file there remains if the process is killed.
+    """
     with ExitStack() as stack:
         with suppress(OSError):
-            mark = stack.enter_context(tempfile.NamedTemporaryFile(dir=folder, prefix=COMPILING))
-            fcntl.flock(mark, fcntl.LOCK_EX)
+            stack.enter_context(_held(folder, fcntl.LOCK_SH))
+            stack.enter_context(tempfile.NamedTemporaryFile(dir=folder, prefix=COMPILING))
         yield
+
+
+@contextmanager
+def _held(folder: Path, how: int) -> Iterator[None]:
+    """A folder locked: by all that compile into it together, or by one alone."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(number, how)
+        yield
+    finally:
+        os.close(number)
 
 
 def _usual() -> Path:
@@ -116,23 +130,13 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
-    late = _begun_by_the_killed(folder)  # first: what is compiled now has not begun then, or is not finished below
+    _remove_what_the_killed_left(folder)
     with os.scandir(folder) as files:  # there may be thousands
         there = {file.name: file for file in files if file.name.startswith(FORMS)}
     strange = {name.split(".")[0] for name, file in there.items() if not trusted(file)}
     ready = (folder / name for name in there if name.endswith(".c.cached"))
     strange |= {file.name.split(".")[0] for file in ready if not file.with_suffix("").exists()}  # FFCx would fail
-    sources = (name for name in there if name.endswith(".c") and f"{name}.cached" not in there)
-    for name in sources:
-        with suppress(OSError):
-            if (folder / f"{name}.cached").exists():  # by now
-                continue
-            written = there[name].stat().st_mtime
-            if written >= late or written < time.time() - UNFINISHED:
-                strange.add(name.split(".")[0])
-    for name in there if strange else ():
-        if name.split(".")[0] in strange:
-            (folder / name).unlink(missing_ok=True)
+    _remove(folder, strange)
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():
             if trusted(file):
@@ -140,23 +144,23 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
                     (folder / file.name).symlink_to(file)
 
 
-def _begun_by_the_killed(folder: Path) -> float:
-    """When the first of those began that were killed while they compiled; infinite if none was, or one goes on."""
-    begun = float("inf")
-    left = list[Path]()
-    for mark in folder.glob(f"{COMPILING}*"):
-        try:
-            with mark.open("rb") as held:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                begun = min(begun, mark.stat().st_mtime)
-        except FileNotFoundError:
-            continue
-        except OSError:
-            return float("inf")  # what is unfinished may be theirs
-        left.append(mark)
-    for mark in left:
-        mark.unlink(missing_ok=True)
-    return begun
+def _remove_what_the_killed_left(folder: Path) -> None:
+    """Nothing goes while one of ours compiles; another program leaves no mark, and has as long as any compilation."""
+    with suppress(OSError), _held(folder, fcntl.LOCK_EX | fcntl.LOCK_NB):
+        left = [*folder.glob(f"{COMPILING}*")]
+        begun = min((mark.stat().st_mtime for mark in left), default=float("inf"))
+        late = time.time() - UNFINISHED
+        sources = [file for file in folder.glob(f"{FORMS}*.c") if not Path(f"{file}.cached").exists()]
+        written = {file.stem: file.stat().st_mtime for file in sources}
+        _remove(folder, {form for form, moment in written.items() if moment >= begun or moment < late})
+        for mark in left:
+            mark.unlink()
+
+
+def _remove(folder: Path, forms: set[str]) -> None:
+    for file in folder.glob(f"{FORMS}*") if forms else ():
+        if file.name.split(".")[0] in forms:
+            file.unlink(missing_ok=True)
 
 
 def _candidates(usual: Path) -> Iterator[Path]:

@@ -1,6 +1,7 @@
 """Where kernels and what is kept beside them come from: nobody else may have put it there."""
 
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -124,20 +125,30 @@ def test_a_form_that_was_never_finished(tmp_path: Path) -> None:
     assert not [*made.glob(f"{kept.COMPILING}*")]
 
 
-def test_a_form_finished_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is whole: only its source would have been taken away, and nobody could compile it again."""
-    made, name = folder(tmp_path / "cache", 0o755), "libffcx_forms_own.c"
+def test_a_form_begun_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever compiles waits while the folder is looked through: nothing new is taken for what was left."""
+    made = folder(tmp_path / "cache", 0o755)
     (made / f"{kept.COMPILING}killed").touch()
-    (made / name).touch()
+    (made / "libffcx_forms_left.c").touch()
+    begin = threading.Thread(target=compile_one, args=(made,))
 
-    def finish(folder: Path) -> float:
-        (made / f"{name}.cached").touch()
-        return begun(folder)
+    def remove(folder: Path, forms: set[str]) -> None:
+        if not begin.ident:  # the first time, under the lock
+            begin.start()
+            begin.join(0.1)
+            assert begin.is_alive()
+        removed(folder, forms)
 
-    begun = kept._begun_by_the_killed
-    monkeypatch.setattr(kept, "_begun_by_the_killed", finish)
+    removed = kept._remove
+    monkeypatch.setattr(kept, "_remove", remove)
     kept._prepare(made, ())
-    assert sorted(file.name for file in made.glob("*.c*")) == [name, f"{name}.cached"]
+    begin.join()
+    assert [file.name for file in made.glob("*.c*")] == ["libffcx_forms_begun.c"]
+
+
+def compile_one(folder: Path) -> None:
+    with kept.compiling(folder):
+        (folder / "libffcx_forms_begun.c").touch()
 
 
 def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
