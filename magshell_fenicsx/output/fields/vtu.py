@@ -205,8 +205,10 @@ class FieldSeries:
             If the disk is full; the file is not written then.
         """
         if self._outlines:
-            write_whole(self._folder / self._outlines.format(number), vtp_content(surface.outlines, surface.solids))
-        write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
+            write_whole(
+                self._folder / self._outlines.format(number), vtp_content(surface.outlines, surface.solids), waits=False
+            )
+        write_whole(self._folder / point_file(number), vtu_content(surface, self._about), waits=False)
         self._rows.append(row or {"point": number})
         self._write_list()
 
@@ -218,7 +220,9 @@ class FieldSeries:
     def _write_list(self) -> None:
         numbers = [int(row["point"]) for row in self._rows]
         names = [(n, [point_file(n), *([self._outlines.format(n)] if self._outlines else [])]) for n in numbers]
-        write_whole(self._folder / "path.pvd", pvd_content(abscissae(self._rows), [files for _, files in names]))
+        write_whole(
+            self._folder / "path.pvd", pvd_content(abscissae(self._rows), [files for _, files in names]), waits=False
+        )
 
 
 def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:

@@ -67,8 +67,10 @@ def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> Non
     write_whole(file, (json.dumps(content, indent=indent) + "\n").encode())
 
 
-def write_whole(file: Path, content: bytes) -> None:
+def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
     """Write a file; at every moment either the complete old file or the complete new one exists.
+
+    Without `waits` a failure of power may lose it: for files that a resumed run writes again where they are not whole.
 
     Raises
     ------
@@ -80,11 +82,12 @@ def write_whole(file: Path, content: bytes) -> None:
         unfinished.unlink(missing_ok=True)  # it may be a link to another file
         stream = AppendedFile(unfinished, 0)
         try:
-            stream.append(content)
+            stream.append(content, waits=waits)
         finally:
             stream.close()
         unfinished.replace(file)
-        sync_folder(file.parent)
+        if waits:
+            sync_folder(file.parent)
     except OSError as e:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
@@ -115,7 +118,7 @@ class AppendedFile:
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
         self._stream.truncate(self._length)
 
-    def append(self, content: bytes) -> None:
+    def append(self, content: bytes, *, waits: bool = True) -> None:
         """Add a piece and wait until it is on disk.
 
         Raises
@@ -127,7 +130,8 @@ class AppendedFile:
         try:
             while left:
                 left = left[self._stream.write(left) :]
-            os.fsync(self._stream.fileno())
+            if waits:
+                os.fsync(self._stream.fileno())
         except OSError as e:
             self._stream.truncate(self._length)
             raise OSError(e.errno, e.strerror, str(self._file)) from None
