@@ -203,11 +203,11 @@ class Blocks:
         """Add the Hessians of one term, as they come from `point_hessian`; `values` is overwritten."""
         values *= factor
         first = 0
-        for target, here, those in self._targets(pairs):
+        for target, rows, columns in self._targets(pairs):
             entities, components, points, _ = target.shape
-            last = first + components * len(those)
-            part = values[:, first:last].reshape(entities, points, components, len(those))
-            target[..., _places(here, those)] += part.transpose(0, 2, 1, 3)
+            last = first + components * len(columns)
+            part = values[:, first:last].reshape(entities, points, components, len(columns))
+            target[..., _places(rows, columns)] += part.transpose(0, 2, 1, 3)
             first = last
 
     def _targets(self, pairs: Pairs) -> Iterator[tuple[Array, tuple[Pair, ...], tuple[Pair, ...]]]:
@@ -248,9 +248,9 @@ def add_own(y: Array, K: Array, nodes: Ints, x: Array) -> None:
     np.add.at(y, nodes[:, b[beside]], np.einsum("epdc,epd->epc", blocks[:, beside], x[nodes[:, a[beside]]]))
 
 
-def add_coupled(y: Array, K: Array, here: Ints, there: Ints, x: Array) -> None:
+def add_coupled(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
     """Add the blocks (pairs of cells, 9, functions^2) and their transposes; see `BlockMatrix.add_coupling`."""
-    n = here.shape[1]
+    n = rows.shape[1]
     blocks = K.reshape(len(K), 3, 3, n, n)
-    np.add.at(y, here, np.einsum("ecdab,ebd->eac", blocks, x[there]))
-    np.add.at(y, there, np.einsum("ecdab,eac->ebd", blocks, x[here]))
+    np.add.at(y, rows, np.einsum("ecdab,ebd->eac", blocks, x[columns]))
+    np.add.at(y, columns, np.einsum("ecdab,eac->ebd", blocks, x[rows]))

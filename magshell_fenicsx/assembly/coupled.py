@@ -119,8 +119,8 @@ def with_entries(K: PETSc.Mat, entries: list[tuple[float, Entries]], fixed: NDAr
         owner = np.searchsorted(K.getOwnershipRanges(), own[0], side="right") - 1
         sent = [tuple(each[owner == rank] for each in own) for rank in range(comm.size)]
         own = tuple(np.concatenate(each) for each in zip(*comm.alltoall(sent), strict=True))
-    found = scipy.sparse.coo_array((own[2], (own[0] - first, own[1])), (last - first, len(fixed))).tocsr()
-    csr = found.indptr.astype(PETSc.IntType), found.indices.astype(PETSc.IntType), found.data
+    rows_of_rank = scipy.sparse.coo_array((own[2], (own[0] - first, own[1])), (last - first, len(fixed))).tocsr()
+    csr = rows_of_rank.indptr.astype(PETSc.IntType), rows_of_rank.indices.astype(PETSc.IntType), rows_of_rank.data
     besides = PETSc.Mat().createAIJ(K.getSizes(), csr=csr, comm=K.comm)
     whole = K.copy()
     whole.axpy(1.0, besides, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -132,7 +132,7 @@ def with_entries(K: PETSc.Mat, entries: list[tuple[float, Entries]], fixed: NDAr
 
 def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
     """This rank's part of the product of entries with a vector of all unknowns, as long as that."""
-    found = np.zeros_like(v)
+    product = np.zeros_like(v)
     for factor, (rows, columns, values) in entries:
-        np.add.at(found, rows, factor * values * v[columns])
-    return found
+        np.add.at(product, rows, factor * values * v[columns])
+    return product

@@ -71,7 +71,7 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
     """
     domain = f.function_space.mesh
     Q = _broken(f.function_space)
-    v, found = ufl.TestFunction(Q), fem.Function(Q)
+    v, derivatives = ufl.TestFunction(Q), fem.Function(Q)
     for share in shares:
         energy = share.term.form
         if f not in energy.coefficients():
@@ -83,10 +83,10 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
             weight = fem.Constant(domain, float(factor))
             form = log.compile(f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v))
             share.term.renew()
-            fem.assemble_vector(found.x.array, form)
-    found.x.scatter_reverse(InsertMode.add)
+            fem.assemble_vector(derivatives.x.array, form)
+    derivatives.x.scatter_reverse(InsertMode.add)
     cells = domain.topology.index_map(domain.topology.dim).size_local
-    return np.asarray(found.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
+    return np.asarray(derivatives.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
 
 
 def _broken(V: fem.FunctionSpace) -> fem.FunctionSpace:

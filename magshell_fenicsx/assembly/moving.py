@@ -276,17 +276,17 @@ class Moving:
 
     def rate(self, mu: Amplitudes, name: str) -> Array:
         """dE/dmu."""
-        found = np.zeros(len(self._r0.x.array))
+        rates = np.zeros(len(self._r0.x.array))
         for body, places in self._with(name):
-            found[body.dofs] = self._components(body, moved(body.motions, mu, places).by[name])
-        return found
+            rates[body.dofs] = self._components(body, moved(body.motions, mu, places).by[name])
+        return rates
 
     def bend(self, mu: Amplitudes, name: str, other: str) -> Array:
         """d2E/dmu_i dmu_j."""
-        found = np.zeros(len(self._r0.x.array))
+        bends = np.zeros(len(self._r0.x.array))
         for body, places in self._with(name, other):
-            found[body.dofs] = self._components(body, moved(body.motions, mu, places).twice[name, other])
-        return found
+            bends[body.dofs] = self._components(body, moved(body.motions, mu, places).twice[name, other])
+        return bends
 
     def on_edges(self, u: Array) -> Array:
         """Nodal forces of p = 1 that the derivative of its potential does not have, see `Pressed.on_edges`."""
@@ -329,6 +329,6 @@ class Moving:
 
 def in_space(v: Array, components: int) -> Array:
     """Vectors (n, 3) of nodes with all components, or with those of the plane of a meridian."""
-    found = np.zeros((len(v) // components, 3))
-    found[:, PLANE[components]] = v.reshape(-1, components)
-    return found
+    vectors = np.zeros((len(v) // components, 3))
+    vectors[:, PLANE[components]] = v.reshape(-1, components)
+    return vectors

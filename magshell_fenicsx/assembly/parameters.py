@@ -89,13 +89,13 @@ def make_parameters(
             if p in term.form.constants()
         ]
 
-    found = {}
+    parameters = {}
     for name, p in constants.items():
         slopes = by(p, forms, f"by {name}")
         for slope in slopes:
             slope.compile_residual()
-        found[name] = Parameter(p, slopes, partial(by, entered=slopes, words="twice"))
-    return found
+        parameters[name] = Parameter(p, slopes, partial(by, entered=slopes, words="twice"))
+    return parameters
 
 
 def derived(energy: ufl.Form, p: fem.Constant) -> ufl.Form:
@@ -148,13 +148,13 @@ class Growing:
 
     def by(self, name: str, of: Callable[[float], float]) -> float:
         """The sum over neighbouring placements of a function of the weight: a derivative of what is linear in it."""
-        here, step = self._values[name], self.steps[name]
-        found = 0.0
+        value, step = self._values[name], self.steps[name]
+        total = 0.0
         for number, weight in FOURTH:
-            self.put(name, here + number * step)
-            found += of(weight / step)
-        self.put(name, here)
-        return found
+            self.put(name, value + number * step)
+            total += of(weight / step)
+        self.put(name, value)
+        return total
 
     def parameters(
         self, terms: Sequence[Term], others: Mapping[str, Parameter], gradients: ResidualAssembler | None = None

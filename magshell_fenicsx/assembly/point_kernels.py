@@ -41,14 +41,14 @@ class Points:
 
     def constant(self, of: fem.Constant) -> fem.Constant:
         """A constant here that takes the value of another constant at every evaluation."""
-        here = fem.Constant(self._mesh, of.value)
-        self._constants.append((here.value, of.value))
-        return here
+        own = fem.Constant(self._mesh, of.value)
+        self._constants.append((own.value, of.value))
+        return own
 
     def evaluate(self, kernel: "PointKernel", count: int) -> Array:
         """(count, components) at the first points; the array is reused by the next call."""
-        for here, of in self._constants:
-            np.copyto(here, of)
+        for own, of in self._constants:
+            np.copyto(own, of)
         if self._values.size < count * kernel.size:
             self._values = np.empty(self.capacity * kernel.size)
         values = self._values[: count * kernel.size].reshape(count, kernel.size)

@@ -193,8 +193,8 @@ class FiniteElementSystem:
 
     def _finite(self, value: float) -> bool:
         """Whether a number is one on all ranks."""
-        here = bool(np.isfinite(value))
-        return here if self.comm.size == 1 else bool(self.comm.allreduce(here, MPI.LAND))
+        finite = bool(np.isfinite(value))
+        return finite if self.comm.size == 1 else bool(self.comm.allreduce(finite, MPI.LAND))
 
     def step_along(self, v: Vector, part: float) -> float:
         """What v is multiplied by so that its largest entry is a part of the system's length; collective."""
@@ -215,18 +215,18 @@ class FiniteElementSystem:
 
     def _motion_curvature(self, moving: Moving, mu: Amplitudes, other: str, name: str) -> float:
         """This rank's part of d2Pi/dmu_i dmu_j, the second amplitude that of a motion."""
-        found = moving.rate(mu, name) @ self._column(mu, other)
+        bend = moving.rate(mu, name) @ self._column(mu, other)
         if other not in moving.names:
-            return float(found)
+            return float(bend)
         R, r = self._gradient(self._factors(mu)), self.u.x.array
-        found += moving.rate(mu, other) @ self._turning_column(mu, name) + moving.bend(mu, name, other) @ R
+        bend += moving.rate(mu, other) @ self._turning_column(mu, name) + moving.bend(mu, name, other) @ R
         rates = dict(moving.turning(mu, other))
         for edge, A in moving.turning(mu, name):
             if edge in rates:
-                found += moving.along(A, r) @ self._turned_column(edge, rates[edge])
+                bend += moving.along(A, r) @ self._turned_column(edge, rates[edge])
         for edge, B in moving.turning_twice(mu, (name, other)):
-            found += moving.along(B, r) @ self._gradient({edge: 1.0})
-        return float(found)
+            bend += moving.along(B, r) @ self._gradient({edge: 1.0})
+        return float(bend)
 
     def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
         """This rank's part of d2Pi/du dmu at all nodes, of the displacement that is set."""
@@ -244,10 +244,10 @@ class FiniteElementSystem:
     def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
         """The part of it that normals of edges make, which turn with the motion."""
         assert self.moving
-        found: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+        column: NDArray[np.float64] = np.zeros_like(self.u.x.array)
         for edge, A in self.moving.turning(mu, name):
-            found += self._turned_column(edge, A)
-        return found
+            column += self._turned_column(edge, A)
+        return column
 
     def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self.moving

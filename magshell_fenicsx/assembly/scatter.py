@@ -106,8 +106,8 @@ class Pattern:
 
     def _find(self, rows: Any, columns: Any) -> Ints:
         keys = rows * np.int64(self._width) + columns
-        found = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return np.where(self._keys[found] == keys, found, -1).astype(np.int32)
+        places = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where(self._keys[places] == keys, places, -1).astype(np.int32)
 
     def _entries(self, rows: Any, columns: Any) -> Longs:
         start, width = self.starts[rows].astype(np.int64), 3 * (self.starts[rows + 1] - self.starts[rows])
@@ -125,9 +125,9 @@ class Pattern:
 
 def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> "scipy.sparse.csr_array":
     """A matrix with each position once, sorted; its values have no meaning."""
-    found = scipy.sparse.coo_array((np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape).tocsr()
-    found.sum_duplicates()
-    return found
+    positions = scipy.sparse.coo_array((np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape).tocsr()
+    positions.sum_duplicates()
+    return positions
 
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ class BlockMatrix:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         self._ffi, self._lib = native(Path(__file__).with_name("scatter.c"), FUNCTIONS, comm)
         self._cells = np.ascontiguousarray(V.dofmap.list)
-        self._coupled = [(self._cells[here], self._cells[there]) for here, there in coupled]
+        self._coupled = [(self._cells[rows], self._cells[columns]) for rows, columns in coupled]
         held = np.zeros((nodes.size_local + nodes.num_ghosts, 3), dtype=bool)
         for bc in clamped:
             held.ravel()[bc.dof_indices()[0]] = True
@@ -166,8 +166,8 @@ class BlockMatrix:
         self._pattern = pattern = Pattern(nodes, self._free_pairs(), comm)
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
         self._coupling_blocks = [
-            np.stack([pattern.blocks(*_pairs(here, there)), pattern.blocks(*_pairs(there, here))], axis=1)
-            for here, there in self._coupled
+            np.stack([pattern.blocks(*_pairs(rows, columns)), pattern.blocks(*_pairs(columns, rows))], axis=1)
+            for rows, columns in self._coupled
         ]
         self._zeros, self._ones = self._held_entries(held)
         n = pattern.owned
@@ -236,9 +236,9 @@ class BlockMatrix:
 
     def _together(self) -> Iterable[tuple[Ints, Ints]]:
         yield self._cells, self._cells
-        for here, there in self._coupled:
-            yield here, there
-            yield there, here
+        for rows, columns in self._coupled:
+            yield rows, columns
+            yield columns, rows
 
     def _held_entries(self, held: NDArray[np.bool_]) -> tuple[Longs, Longs]:
         """This rank's entries in clamped rows and columns, and the diagonal ones among them."""

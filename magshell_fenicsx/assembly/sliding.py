@@ -65,9 +65,9 @@ class Projection:
 
     def project(self, u: Array) -> None:
         """Project a vector of owned nodes, with or without ghosts, in place."""
-        here = self._nodes < len(u) // 3
-        nodes, x = self._nodes[here], u.reshape(-1, 3)
-        x[nodes] = np.einsum("nij,nj->ni", self._P[here], x[nodes])
+        owned = self._nodes < len(u) // 3
+        nodes, x = self._nodes[owned], u.reshape(-1, 3)
+        x[nodes] = np.einsum("nij,nj->ni", self._P[owned], x[nodes])
 
     def outside(self, u: Array) -> Array:
         """u - P u: rounding, which the extrapolation of a path would multiply from step to step."""
@@ -93,19 +93,19 @@ class Projection:
 
     def mass(self, M: PETSc.Mat) -> PETSc.Mat:
         """P M P, symmetric; held directions then have no finite eigenvalue. Collective."""
-        found = self.both_sides(M)
-        found.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        return found
+        product = self.both_sides(M)
+        product.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return product
 
     def _blocks(self, blocks: Array, elsewhere: float) -> PETSc.Mat:
         """The block-diagonal matrix with blocks at these nodes and a number on the diagonal elsewhere."""
         n, first = 3 * self._owned, 3 * self._first
         mat = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
-        here = self._nodes < self._owned
-        rest = np.setdiff1d(np.arange(self._owned), self._nodes[here])
+        owned = self._nodes < self._owned
+        rest = np.setdiff1d(np.arange(self._owned), self._nodes[owned])
         for i in (3 * rest[:, None] + np.arange(3)).ravel() if elsewhere else ():
             mat.setValue(first + i, first + i, elsewhere)
-        for node, block in zip(self._nodes[here], blocks[here], strict=True):
+        for node, block in zip(self._nodes[owned], blocks[owned], strict=True):
             rows = (first + 3 * node + np.arange(3)).astype(PETSc.IntType)
             mat.setValues(rows, rows, block)
         mat.assemble()

@@ -72,8 +72,8 @@ class WholeMatrix:
         alone = self._comm.size == 1
         into = self._inner.reshape(self._owned, 3, self._count, 3) if alone else None  # nothing is copied
         rows = self._own(self.rows(terms, into)).reshape(n, 3 * self._count)
-        here, everywhere = self._held
-        rows[here], rows[:, everywhere] = 0.0, 0.0
+        own, everywhere = self._held
+        rows[own], rows[:, everywhere] = 0.0, 0.0
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
         if not alone:

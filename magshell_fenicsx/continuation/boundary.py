@@ -79,10 +79,10 @@ class Boundary:
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
         if self.family.at(p).factor_at(state).skewed:
             raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
-        found = self._solved(p, state, phi, Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
-        if isinstance(found, str):
-            raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {found}")
-        return replace(found, p=p)
+        again = self._solved(p, state, phi, Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
+        if isinstance(again, str):
+            raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {again}")
+        return replace(again, p=p)
 
     def followed(
         self, start: Locus, sense: float, ends: tuple[float, float], steps: int
@@ -113,24 +113,24 @@ class Boundary:
                     yield from self._between(here, *last)
                     yield "end", last[0]
                     return
-            found: Locus | str = "the end of the range is not reached at once"
+            tried: Locus | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
-                found = self._at_distance(here, guess, length)
-            if isinstance(found, str):
+                tried = self._at_distance(here, guess, length)
+            if isinstance(tried, str):
                 length /= 2
                 if length < SMALLEST * first:
-                    raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {found}")
+                    raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {tried}")
                 continue
-            yield from self._between(here, found, length)
-            if not ends[0] < found.p < ends[1]:  # the prediction had not shown it
+            yield from self._between(here, tried, length)
+            if not ends[0] < tried.p < ends[1]:  # the prediction had not shown it
                 length /= 2
                 continue
-            yield "point", found
-            straight = self.inner(here.way, found.way) > STRAIGHT
-            step, before, here = length, (here, length), found
-            if found.factorisations <= EASY and straight:
+            yield "point", tried
+            straight = self.inner(here.way, tried.way) > STRAIGHT
+            step, before, here = length, (here, length), tried
+            if tried.factorisations <= EASY and straight:
                 length = 1.5 * length
-            elif found.factorisations > 2 * EASY:
+            elif tried.factorisations > 2 * EASY:
                 length = 0.7 * length
             length = min(length, 1.2 * most / max(abs(here.way.dp), 1e-300), 3 * first, 2 * step)
         raise BoundaryLost(f"{MOST_POINTS} points have not reached the end of the range")
@@ -179,15 +179,15 @@ class Boundary:
             return self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
 
         row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
-        found = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look)
-        if isinstance(found, str):
-            return found
-        off = Way(found.state.u - guess.du, found.state.mu[name] - guess.dmu, found.p - guess.dp)
+        point = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look)
+        if isinstance(point, str):
+            return point
+        off = Way(point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp)
         if np.sqrt(self.inner(off, off)) > GAP * abs(length):
             return "a step ends far from its prediction"
-        if self.inner(way, found.way) < MOST_TURN:
+        if self.inner(way, point.way) < MOST_TURN:
             return "the boundary turns too sharply"
-        return found
+        return point
 
     def _last(
         self, before: tuple[Locus, float] | None, here: Locus, length: float, ends: tuple[float, float]
@@ -201,11 +201,11 @@ class Boundary:
         guess = self._ahead(before, here, high)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
         row = Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
-        found = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
-        if isinstance(found, str) or found.way.dp * here.way.dp < 0 or self.inner(found.way, here.way) < MOST_TURN:
+        last = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
+        if isinstance(last, str) or last.way.dp * here.way.dp < 0 or self.inner(last.way, here.way) < MOST_TURN:
             return None
-        off = Way(found.state.u - guess.du, found.state.mu[self.name] - guess.dmu, 0.0)
-        return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(found, p=end), high)
+        off = Way(last.state.u - guess.du, last.state.mu[self.name] - guess.dmu, 0.0)
+        return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(last, p=end), high)
 
     def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
         """Where p turns between two points: the stationary point of the cubic through both, repeated."""
@@ -214,17 +214,17 @@ class Boundary:
         for _ in range(MOST_TRIALS):
             s = _zero_of_slope(a, low, b, high, base, self)
             guess = self._hermite(low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a))
-            found = self._at_distance(base, guess, s)
-            if isinstance(found, str):  # rounding: the cubic is as good
+            middle = self._at_distance(base, guess, s)
+            if isinstance(middle, str):  # rounding: the cubic is as good
                 state = best.state.with_(guess.du, self.name, float(guess.dmu))
                 return replace(best, p=float(guess.dp), state=state)
-            best = found if abs(found.way.dp) < abs(best.way.dp) else best
-            other, gap = (high, b - s) if found.way.dp * low.way.dp > 0 else (low, s - a)
-            curvature = abs(other.way.dp - found.way.dp) / gap
-            rest = found.way.dp**2 / (2 * curvature) if curvature else 0.0
+            best = middle if abs(middle.way.dp) < abs(best.way.dp) else best
+            other, gap = (high, b - s) if middle.way.dp * low.way.dp > 0 else (low, s - a)
+            curvature = abs(other.way.dp - middle.way.dp) / gap
+            rest = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
             if rest <= SPECIAL * self.scales[1] or min(s - a, b - s) < 1e-9 * length:
                 break
-            low, high, a, b = (found, high, s, b) if found.way.dp * low.way.dp > 0 else (low, found, a, s)
+            low, high, a, b = (middle, high, s, b) if middle.way.dp * low.way.dp > 0 else (low, middle, a, s)
         return best
 
     def _meeting(self, low: Locus, high: Locus, length: float) -> Locus | None:
@@ -232,27 +232,27 @@ class Boundary:
 
         The bordered tangent is singular there, so the point itself is interpolated between others close by.
         """
-        known, a, b = list[tuple[float, float, Locus]](), 0.0, length
+        looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
         s = length / 2
-        while len(known) < MOST_LOOKS:
+        while len(looked_at) < MOST_LOOKS:
             tried = self._at_distance(low, self._hermite(low, high, length, s / length), s, look=True)
-            if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in known):
+            if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in looked_at):
                 break
-            known = sorted([*known, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
+            looked_at = sorted([*looked_at, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
             a, b = (s, b) if tried.unstable == low.unstable else (a, s)
             s = (a + b) / 2
-            if len(known) > 1:
-                ahead = _interpolated([each[1] for each in known], [each[0] for each in known], 0.0)
+            if len(looked_at) > 1:
+                ahead = _interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
                 s = ahead if a < ahead < b else s
-                if abs(s - known[0][0]) < CLOSE * length:
+                if abs(s - looked_at[0][0]) < CLOSE * length:
                     break
-        if len(known) < 2:
-            return known[0][2] if known else None
-        places, mu = [each[0] for each in known], self.name
-        found, loads = known[0][2], [each[2].state.mu[mu] for each in known]
-        p, load = _interpolated(places, [each[2].p for each in known], s), _interpolated(places, loads, s)
+        if len(looked_at) < 2:
+            return looked_at[0][2] if looked_at else None
+        places, mu = [each[0] for each in looked_at], self.name
+        nearest, loads = looked_at[0][2], [each[2].state.mu[mu] for each in looked_at]
+        p, load = _interpolated(places, [each[2].p for each in looked_at], s), _interpolated(places, loads, s)
         error = abs(load - _interpolated(places[:-1], loads[:-1], s))
-        return replace(found, p=p, state=found.state.with_(found.state.u, mu, load), load_error=error)
+        return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
 
     def _solved(
         self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool = False

@@ -229,16 +229,16 @@ def refined_tangent(
     def times(t: Direction) -> Direction:
         return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
 
-    z, known = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
+    z, directions = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
     for _ in range(MOST_REFINEMENTS):
         if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
             return t
         p, q = z, times(z)
-        for before, image, square in known:
+        for before, image, square in directions:
             part = matrix.inner(image, q) / square
             p, q = plus(p, -part, before), plus(q, -part, image)
-        known.append((p, q, matrix.inner(q, q)))
-        part = matrix.inner(z, q) / known[-1][2]
+        directions.append((p, q, matrix.inner(q, q)))
+        part = matrix.inner(z, q) / directions[-1][2]
         t, z = plus(t, part, p), plus(z, -part, q)
     return None
 

@@ -90,8 +90,8 @@ class Factorisation:
         return -1 if self._definite else self._calm
 
     @habit.setter
-    def habit(self, known: int) -> None:
-        self._definite, self._calm = self._has_cholmod and known < 0, max(known, 0)
+    def habit(self, pivots: int) -> None:
+        self._definite, self._calm = self._has_cholmod and pivots < 0, max(pivots, 0)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -142,8 +142,8 @@ def held_along(
 def third(system: System, state: State, v: Vector) -> Vector:
     """Pi'''(v, v, .), by a second difference of the residual."""
     d = _offset(system, v)
-    back, here, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 0, 1))
-    return np.asarray((back - 2 * here + ahead) / d**2)
+    back, residual, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 0, 1))
+    return np.asarray((back - 2 * residual + ahead) / d**2)
 
 
 def times_tangent(system: System, state: State, v: Vector) -> Vector:
@@ -261,7 +261,7 @@ def sensitivity(system: System, fold: Fold, column: Vector) -> float:
     return -dot(system.comm, fold.left, column) / pull
 
 
-def predict_fold(system: System, known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+def predict_fold(system: System, folds: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
     """Extrapolate folds at other values of a parameter to `p`.
 
     The polynomials through the last one, two and three folds are compared, and the one with the least residual is
@@ -276,13 +276,13 @@ def predict_fold(system: System, known: Sequence[tuple[float, Fold]], p: float, 
     others
         The other amplitudes at `p`.
     """
-    guesses = [_extrapolated(known[-n:], p, others) for n in range(1, min(len(known), 3) + 1)]
+    guesses = [_extrapolated(folds[-n:], p, others) for n in range(1, min(len(folds), 3) + 1)]
     residuals = [system.residual(guess.state.u, guess.state.mu) for guess in guesses]
     return guesses[int(np.argmin([dot(system.comm, R, R) for R in residuals]))]
 
 
-def _extrapolated(known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
-    values, folds = [value for value, _ in known], [fold for _, fold in known]
+def _extrapolated(located: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+    values, folds = [value for value, _ in located], [fold for _, fold in located]
     weights = [_lagrange(values, i, p) for i in range(len(values))]
     u = np.sum([w * fold.state.u for w, fold in zip(weights, folds, strict=True)], axis=0)
     mu = sum(w * fold.value for w, fold in zip(weights, folds, strict=True))

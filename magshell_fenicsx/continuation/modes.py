@@ -128,9 +128,9 @@ class _Space:
                     theta, w = rival, rival_w
         return _Pair(1 / theta, w, error)
 
-    def _sums(self, here: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _sums(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inner products over all ranks."""
-        return np.asarray(self._comm.allreduce(here))
+        return np.asarray(self._comm.allreduce(shares))
 
 
 def _real_pairs(A: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -297,15 +297,15 @@ class Path:
         reason = self._jumped(here, point)
         return _Far(point, reason, turned) if reason else self.as_base(point)
 
-    def _jumped(self, here: Point, found: Point) -> str | None:
+    def _jumped(self, here: Point, there: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
-        length = found.s - here.s
-        if abs(found.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
+        length = there.s - here.s
+        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
-        chord = found.state.u - here.state.u
-        unexplained = chord - length / 2 * (here.du + found.du)
+        chord = there.state.u - here.state.u
+        unexplained = chord - length / 2 * (here.du + there.du)
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
-        if self._cosine(here, found) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
+        if self._cosine(here, there) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
             return "the path turns sharply, or the step jumped to another branch"
         return None
 

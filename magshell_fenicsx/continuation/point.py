@@ -84,7 +84,7 @@ class Journal(Protocol):
         Collective. It may raise an exception to stop the history before a new solve begins.
         """
 
-    def record(self, found: Point | str) -> None:
+    def record(self, result: Point | str) -> None:
         """Keep a result. Collective."""
 
     def begin(self, space: object) -> None:
@@ -103,7 +103,7 @@ class NoJournal:
     def replay(self) -> None:
         return None
 
-    def record(self, found: Point | str) -> None:
+    def record(self, result: Point | str) -> None:
         pass
 
     def begin(self, space: object) -> None:

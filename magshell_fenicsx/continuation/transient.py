@@ -311,9 +311,9 @@ class Integrator:
     def factor(self, at: Factored) -> None:
         """Make these factors."""
         self.factorisation.habit = at.habit
-        rule, part, here, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
+        rule, part, u, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
         rate = rule.gamma / (rule.beta * dt)
-        tangent = self.viscous.tangent(here, mu, dt, rate) if self.viscous else self.system.tangent(here, mu)
+        tangent = self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed) else tangent
         if self._K is None:
@@ -325,7 +325,7 @@ class Integrator:
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         whole = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
         if self.device:
-            C, D = self.device.edge(here, mu)
+            C, D = self.device.edge(u, mu)
             self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))
         else:
             self.factorisation.factor(whole)

@@ -351,12 +351,12 @@ class Walk:
                 except PathStopped:  # the step had left the branch: approach in shorter steps
                     shorter, why = abs(point.s - low.s) / 4, "an instability cannot be located"
                     break
-                for label, found, self.done in between:
-                    yield label, found
+                for label, event, self.done in between:
+                    yield label, event
                     if label == "fold":
-                        self._refuse_loop(found)
+                        self._refuse_loop(event)
                     if self.done:
-                        self.points.append(found)
+                        self.points.append(event)
                         return
                 self.points.append(point)
                 self.done = not self._ahead() or (self.goal.until == "points" and len(self.points) > self.goal.steps)
@@ -377,8 +377,8 @@ class Walk:
         """Stop at a fold that was passed before. Two successive folds may be close, so the last one is not compared."""
         name, u = self.path.name, fold.state.u
         mu = fold.state.mu[name]
-        for known in self._folds[:-1]:
-            if self.path.metric.norm(u - known.state.u, mu - known.state.mu[name]) < SAME:
+        for passed in self._folds[:-1]:
+            if self.path.metric.norm(u - passed.state.u, mu - passed.state.mu[name]) < SAME:
                 said = "the path has come back to this fold: a closed loop, which leads nowhere else"
                 raise PathStopped(said, fold, final=True)
         self._folds.append(fold)
@@ -389,13 +389,13 @@ class Walk:
 
     def _ahead(self) -> list[float]:
         """The values of s that are still to be reached."""
-        goal, here = self.goal, self.points[-1].s
+        goal, s = self.goal, self.points[-1].s
         if self._by_arc:
             return [np.inf]
         if not goal.targets:
             return [float(np.copysign(np.inf, goal.sense))]
         sense = goal.targets[-1] - self.points[0].s
-        return [t for t in goal.targets if (t - here) * sense > 0]
+        return [t for t in goal.targets if (t - s) * sense > 0]
 
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
         """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""

@@ -60,9 +60,9 @@ class Step:
         middle = self._middle(low, high, solve=abs(after - before) > 1 and halvings > 0)
         if middle is None:
             base = self._path.as_base(low)
-            found = locate_bifurcation(self._path, base, self._path.measured_from(base, high), change.stability)
-            self._kept(found)
-            yield found, after - before
+            crossing = locate_bifurcation(self._path, base, self._path.measured_from(base, high), change.stability)
+            self._kept(crossing)
+            yield crossing, after - before
         else:
             counts[id(middle)] = change.stability.factor_at(middle.state).negative_pivots
             yield from self._between(low, middle, change, counts, halvings - 1)
@@ -238,14 +238,14 @@ class Watch:
 
     def _changes(self) -> list[Crossing]:
         """Look at the last point and, if necessary, at the skipped ones; the crossings up to it."""
-        before, here = self._looked, self._look(self._last, self._along)
-        softer = before is not None and here.softest < min(self._at_least, before.softest / 2)
-        changed = here.counts != before.counts if before else any(here.counts)
-        looks, self._may_pass = [here], min(max(1, 2 * len(self._passed)), MOST_PASSED)
+        before, last = self._looked, self._look(self._last, self._along)
+        softer = before is not None and last.softest < min(self._at_least, before.softest / 2)
+        changed = last.counts != before.counts if before else any(last.counts)
+        looks, self._may_pass = [last], min(max(1, 2 * len(self._passed)), MOST_PASSED)
         if self._passed and (softer or changed):
-            looks, self._may_pass = [*(self._look(*passed) for passed in self._passed), here], 0
+            looks, self._may_pass = [*(self._look(*passed) for passed in self._passed), last], 0
         looks = [before, *looks] if before else looks
-        self._looked, self._passed = here, []
+        self._looked, self._passed = last, []
         self._rate = _rate(*looks[-2:]) if len(looks) > 1 else None
         changes = [] if before else list(self._at_start(looks[0]))
         for low, high in pairwise(looks):
@@ -268,11 +268,11 @@ class Watch:
                 located += [(step.place(p), family.label, p, rise) for p, rise in step.crossings(change)]
             except PathStopped as e:
                 self.unlocated = self.unlocated or str(e)
-        found, unstable = list[Crossing](), sum(low.counts)
+        crossings, unstable = list[Crossing](), sum(low.counts)
         for _, label, point, rise in sorted(located, key=lambda item: item[0]):
-            found.append(Crossing(label, point, min(unstable, unstable + rise)))
+            crossings.append(Crossing(label, point, min(unstable, unstable + rise)))
             unstable += rise
-        return found
+        return crossings
 
     def _look(self, point: Point, along: float) -> _Look:
         state = self._expand(point.state)

@@ -41,8 +41,8 @@ def library(name: str, source: Callable[[], str], options: tuple[str, ...]) -> P
     options = (*options, *processor_options())
     depends = hashlib.sha256("\n".join((name, *options)).encode()).hexdigest()[:40]
     file, folder = f"libmagshell_{depends}.so", kernel_cache()
-    if there := kept_file(file):
-        return there
+    if kept := kept_file(file):
+        return kept
     with written_into(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with _alone(folder / f"{file}.lock"):

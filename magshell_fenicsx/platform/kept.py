@@ -132,9 +132,9 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     """
     _remove_what_the_killed_left(folder)
     with os.scandir(folder) as files:  # there may be thousands
-        there = {file.name: file for file in files if file.name.startswith(FORMS)}
-    strange = {name.split(".")[0] for name, file in there.items() if not trusted(file)}
-    ready = (folder / name for name in there if name.endswith(".c.cached"))
+        forms = {file.name: file for file in files if file.name.startswith(FORMS)}
+    strange = {name.split(".")[0] for name, file in forms.items() if not trusted(file)}
+    ready = (folder / name for name in forms if name.endswith(".c.cached"))
     strange |= {file.name.split(".")[0] for file in ready if not file.with_suffix("").exists()}  # FFCx would fail
     _remove(folder, strange)
     for other in also:

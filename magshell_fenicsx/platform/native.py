@@ -29,8 +29,8 @@ def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
     name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 
     def compiled() -> Path:
-        if there := kept_file(f"{name}.so"):
-            return there
+        if kept := kept_file(f"{name}.so"):
+            return kept
         try:
             _compile(name, folder, text, declarations)
         except (OSError, cffi.VerificationError) as e:

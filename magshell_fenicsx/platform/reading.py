@@ -121,10 +121,10 @@ class Files:
                 self.contents[file] = read_whole(file)
             except OSError as e:
                 self.contents[file] = e
-        known = self.contents[file]
-        if isinstance(known, OSError):
-            raise known.with_traceback(None)
-        return known
+        content = self.contents[file]
+        if isinstance(content, OSError):
+            raise content.with_traceback(None)
+        return content
 
     def digest(self, file: Path) -> str | None:
         """Hash of the content of a file; None if it cannot be read."""
@@ -173,10 +173,10 @@ def arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
 
 def _declared(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
     """The bytes of an array as floats, from its head alone; at least those that the archive declares."""
-    known: Any = np.lib.format
+    format_of_numpy: Any = np.lib.format
     with archive.open(member) as stream:
-        version = known.read_magic(stream)
-        head = known.read_array_header_1_0 if version == (1, 0) else known.read_array_header_2_0
+        version = format_of_numpy.read_magic(stream)
+        head = format_of_numpy.read_array_header_1_0 if version == (1, 0) else format_of_numpy.read_array_header_2_0
         shape, _, kind = head(stream)
     return max(member.file_size, prod(map(int, shape)) * max(int(kind.itemsize), 8))
 
@@ -213,12 +213,12 @@ def vtk_data(content: bytes, suffix: str) -> "pyvista.DataSet":
 def _declared_by_vtk(content: bytes) -> int:
     """Bytes of the numbers that the heads in a VTK file declare: of its points and of all arrays at them."""
     if b"<VTKFile" not in content[:4096]:
-        counts = [prod(map(int, found)) for found in LEGACY_GRID.findall(content)]
-        counts += [int(found) for found in LEGACY.findall(content)]
+        counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
+        counts += [int(numbers) for numbers in LEGACY.findall(content)]
         fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
         return 8 * (3 * max(counts, default=0) + sum(fields))
-    extents = [[int(n) for n in re.findall(rb"-?\d+", found)] for found in EXTENT.findall(content)]
+    extents = [[int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)]
     points = [prod(abs(b - a) + 1 for a, b in zip(each[::2], each[1::2], strict=False)) for each in extents]
     most = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
-    widths = [int(found[1]) if (found := COMPONENTS.search(tag)) else 1 for tag in WIDTH.findall(content)]
+    widths = [int(numbers[1]) if (numbers := COMPONENTS.search(tag)) else 1 for tag in WIDTH.findall(content)]
     return 8 * most * (3 + sum(widths))

@@ -107,9 +107,9 @@ def fitting(parts: Sequence[str], columns: int) -> str:
     '5 points  w/h 14 -> 20  1:50, about 0:30 left'
     """
     first, *others = parts
-    found = first[:columns]
+    line = first[:columns]
     for part in others:
-        if len(found) + 2 + len(part) > columns:
+        if len(line) + 2 + len(part) > columns:
             break
-        found += f"  {part}"
-    return found
+        line += f"  {part}"
+    return line

@@ -40,10 +40,10 @@ def account(
         included.append(_imperfections(context, rims))
     for step in {step.name: step for step in context.steps}.values():
         included += [said] if (said := step.load.account(step, context)) else []
-    there = parts_of(context)
+    parts = parts_of(context)
     for key, part in PARTS.items():
-        if key in there:
-            included.append(there[key].account(context.scales))
+        if key in parts:
+            included.append(parts[key].account(context.scales))
         else:
             left_out.append(part.absent)
     if model == "meridian":

@@ -256,8 +256,8 @@ def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None
 def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
     """The squares' integrals of the square of a formula, less those of samples that have not half of it."""
     away, square = scipy.spatial.cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
-    there = np.isfinite(away) & (leaves.size < side)
-    whole = np.bincount(square[there], (leaves.area * leaves.away)[there], len(middle))
+    missed = np.isfinite(away) & (leaves.size < side)
+    whole = np.bincount(square[missed], (leaves.area * leaves.away)[missed], len(middle))
     return np.where(sampled < HALF * whole, whole, 0.0)
 
 
@@ -271,11 +271,11 @@ def refinements(
         return drawn.embedding(chart) @ Q
 
     finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
-    found = (
+    areas = (
         squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.load])
         for each, leaves in zip(formulas, narrow, strict=True)
     )
-    return [each for each in found if each]
+    return [each for each in areas if each]
 
 
 def of_imperfections(flaws: Iterable[Flaw], perfect: Outline, turn: float, h: float) -> tuple[list[Squares], float]:
@@ -287,17 +287,17 @@ def of_imperfections(flaws: Iterable[Flaw], perfect: Outline, turn: float, h: fl
         return perfect.perfect(chart) @ Q
 
     for flaw in flaws:
-        found = flaw.sizes and squares(places, perfect, _smallest(flaw.sizes), SMALLEST_FLAW * h)
-        if found is None:
+        area = flaw.sizes and squares(places, perfect, _smallest(flaw.sizes), SMALLEST_FLAW * h)
+        if area is None:
             everywhere = min(everywhere, flaw.size)
             continue
         assert not isinstance(shape, MeshFile)  # it has no squares
         low, high = extent(shape)
-        alike = PER_AREA * float(np.prod(high - low)) / found.size**2
-        if found.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
-            local.append(found)
+        alike = PER_AREA * float(np.prod(high - low)) / area.size**2
+        if area.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
+            local.append(area)
         else:
-            everywhere = min(everywhere, found.size)
+            everywhere = min(everywhere, area.size)
     return local, everywhere
 
 

@@ -28,26 +28,26 @@ def surface_terms(context: Context, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ..
     CaseError
         If a part's amplitude is out of bounds, a name is taken, or a solid cannot have a term.
     """
-    found = []
+    terms = []
     for key, part in parts_of(context).items():
         for term in part.terms(context.scales):
             if term.density and not LEAST <= abs(term.value) <= MOST:
                 raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
-            found.append(term)
+            terms.append(term)
     for step in {step.name: step for step in context.steps}.values():
-        found += step.load.terms(step, context)
-    found += own
-    names = [name for term in found for name in ((term.name,) if term.density else ()) + tuple(term.observed)]
-    names += {p.name for term in found for p in term.free}
+        terms += step.load.terms(step, context)
+    terms += own
+    names = [name for term in terms for name in ((term.name,) if term.density else ()) + tuple(term.observed)]
+    names += {p.name for term in terms for p in term.free}
     for name in names:
         if name in TAKEN or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
-    for term in found if context.solid else []:
+    for term in terms if context.solid else []:
         if term.on is not None:
             raise CaseError(f"model: solid: {term.name} is an energy of an edge, which only a shell has")
         if curved := [f"r0.{name}" for name in term.placed_parts if name in SECOND]:
             raise CaseError(f"model: solid: {term.name} depends on {', '.join(curved)}, which only a shell has")
-    return tuple(found)
+    return tuple(terms)
 
 
 def refuse_unfit(
@@ -93,8 +93,8 @@ def open_edges(patch: PatchMesh, conditions: Mapping[str, Condition], on: Collec
     sides = {name: {(int(a), int(b)) for a, b in np.sort(edge, axis=1)} for name, edge in patch.edges.items()}
     if on:
         inside = np.logical_or.reduce([patch.patches[name] for name in on])
-        there = set(map(int, patch.corners[inside].ravel()))
-        sides = {name: {pair for pair in pairs if there.issuperset(pair)} for name, pairs in sides.items()}
+        vertices = set(map(int, patch.corners[inside].ravel()))
+        sides = {name: {pair for pair in pairs if vertices.issuperset(pair)} for name, pairs in sides.items()}
     return without_potential(
         moving(sides, conditions), conditions, lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])])
     )

@@ -232,8 +232,8 @@ def quantity(name: str) -> Quantity:
 
 def shown(name: str, columns: Collection[str]) -> Quantity:
     """The quantity of a column, in the case's units if one of the columns has it in these."""
-    known = quantity(name)
-    return next((each for each in known.in_units if each.name in columns), known)
+    quantity_of_column = quantity(name)
+    return next((each for each in quantity_of_column.in_units if each.name in columns), quantity_of_column)
 
 
 def amplitude(name: str) -> Amplitude:
@@ -309,10 +309,10 @@ class Sizes:
         """The unit in which a column is shown; None if it has none in this case."""
         if name in self.ways:
             return self.ways[name][0]
-        there = [unit for unit in quantity(name).units if self._size(unit) is not None]
+        units = [unit for unit in quantity(name).units if self._size(unit) is not None]
         if name in self.moments:
-            there = [unit for unit in there if unit is MOMENT]
-        return next(iter(there), None)
+            units = [unit for unit in units if unit is MOMENT]
+        return next(iter(units), None)
 
     def column(self, name: str) -> Quantity | None:
         """The column in units for a dimensionless one; None if there is none."""
