@@ -80,11 +80,11 @@ def _described(case: Case, problem: Problem) -> str:
 
 def _in_units(case: Case) -> list[str]:
     """The sizes of a case with units."""
-    known = sizes_of(case.context)
-    named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", known.field)}
+    sizes = sizes_of(case.context)
+    named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", sizes.field)}
     factor = {"λ_m": case.lambda_m}
-    there = {scale: words for scale, words in named.items() if scale in known.of}
-    return [f"{name} = {known.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in there.items()]
+    shown = {scale: words for scale, words in named.items() if scale in sizes.of}
+    return [f"{name} = {sizes.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in shown.items()]
 
 
 def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:

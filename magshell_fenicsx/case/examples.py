@@ -30,12 +30,12 @@ def write_example(name: str, file: Path | None = None) -> list[Path]:
     CaseError
         If there is no such example, or a file cannot be written or would be overwritten.
     """
-    known = examples()
-    if name not in known:
-        raise CaseError(f"example {name}: there is no such case, only {', '.join(known)}")
+    of_package = examples()
+    if name not in of_package:
+        raise CaseError(f"example {name}: there is no such case, only {', '.join(of_package)}")
     target = file or Path(f"{name}.yaml")
     try:
-        return _written(_contents(known[name], target), target)
+        return _written(_contents(of_package[name], target), target)
     except OSError as e:
         raise CaseError(f"{e.filename or target}: cannot be written: {e.strerror}") from None
 

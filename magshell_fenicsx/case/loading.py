@@ -36,12 +36,12 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     if not isinstance(loading, Sequence):
         before = [pair for kind in FIRST for pair in STEPS[kind].before(context, loading)]
     keyed = [*before, *listed(loading).items()]
-    loads, known = [load for _, load in keyed], dict[str, list[Any]]()
+    loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
     for number, (key, load) in enumerate(keyed, 1):
         name = load.name_in(context, loads)
         if name is None:
-            places = known.setdefault(load.amplitude, [])
+            places = places_of.setdefault(load.amplitude, [])
             if load.place not in places:
                 places.append(load.place)
             which = places.index(load.place) + 1
@@ -112,6 +112,6 @@ def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surfa
         return
     if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
         raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
-    known = [*(dimples or ["dimple"]), "rest"]
-    if unknown := set(patches) - set(known):
-        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")
+    allowed = [*(dimples or ["dimple"]), "rest"]
+    if unknown := set(patches) - set(allowed):
+        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(allowed[:-1])} and rest")

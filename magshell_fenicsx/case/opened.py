@@ -58,11 +58,11 @@ def with_same_files(case: Case, comm: MPI.Comm) -> Case:
     if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
         return case
     own = case.model_dump_json()
-    first, found = from_first(comm, lambda: (own, {key: _content(reader) for key, reader in readers.items()}))
+    first, contents = from_first(comm, lambda: (own, {key: _content(reader) for key, reader in readers.items()}))
     if sum(comm.allgather(first != own)):
         raise CaseError("the ranks were given different cases: give the same on each, or the path of a file")
     for key, reader in readers.items():
-        reader.files.contents[reader.path] = found[key]
+        reader.files.contents[reader.path] = contents[key]
     for reader in readers.values():
         reader.files.shared = True
     return case
@@ -118,16 +118,16 @@ def _of_data(case: Case, key: str, value: Any) -> Case:
 
 def _written(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """Plain data with another value, in the unit that the one before had."""
-    found = deepcopy(dict(data))
+    changed = deepcopy(dict(data))
     *path, last = key.split(".")
-    part: Any = found
+    part: Any = changed
     for name in path:
         part = part[int(name)] if isinstance(part, list) else part.setdefault(name, {})
     at: Any = int(last) if isinstance(part, list) else last
-    known = part[at] if isinstance(part, list) else part.get(at)
-    unit = number_and_unit(known)[1] if isinstance(known, str) else ""
+    before = part[at] if isinstance(part, list) else part.get(at)
+    unit = number_and_unit(before)[1] if isinstance(before, str) else ""
     part[at] = f"{value / si_size(unit)!r} {unit}" if unit and value is not None else value
-    return found
+    return changed
 
 
 def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:

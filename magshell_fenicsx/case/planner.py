@@ -72,10 +72,10 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber, shells=of_shells)
     ground = ground_of(case.shell)
     perfect = ground.perfect
-    found = flaws(case.imperfections, ground)
+    imperfections = flaws(case.imperfections, ground)
     context, last = case.context, {step.name: step for step in case.programme}
-    still = {*found} - {key for step in last.values() for key in step.load.multiplies(step, context)}
-    drawn = imperfect(perfect, found, 0.0, still)
+    still = {*imperfections} - {key for step in last.values() for key in step.load.multiplies(step, context)}
+    drawn = imperfect(perfect, imperfections, 0.0, still)
     ground = replace(ground, drawn=drawn)
     standing = case.bodies, case.approaches, {step.name for step in case.programme}
     at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
@@ -89,7 +89,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     energies = surface_terms(context, terms)
     parts = _left(case, drawn, energies)
-    parts += leaves(found, perfect, each=bool(case.patches))
+    parts += leaves(imperfections, perfect, each=bool(case.patches))
     parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
     axisymmetric, plane = _symmetry(case, drawn, parts)
     half = plane is not None
@@ -110,8 +110,8 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     loaded: list[Loaded] = [(points[at], [step.load]) for step in case.programme for at in step.load.named_points()]
     for point in dict.fromkeys(under.values()):
         loaded.append((points[point], [step.load for step in case.programme if under.get(step.name) == point]))
-    local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
-    wide = [flaw for flaw in found.values() if flaw.centre is None]
+    local = [] if isinstance(case.shell, MeshSurface) else spots(imperfections.items(), perfect, turn)
+    wide = [flaw for flaw in imperfections.values() if flaw.centre is None]
     everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
     bodies = contacts(*standing, replace(ground, turn=turn))
     stood = replace(ground, drawn=drawn)
@@ -121,7 +121,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         varying += refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
     size = grading(context, drawn, material.h, [*local, *touched], everywhere, loaded, varying, local=bool(local))
-    drawn = imperfect(perfect, found, turn, still)
+    drawn = imperfect(perfect, imperfections, turn, still)
     if isinstance(beyond, Sector):
         size = towards_tip(size, beyond)
     shape = drawn.chart(beyond, size)
@@ -139,15 +139,15 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost}
         conditions |= dict.fromkeys(beyond.sides, "symmetry")
-    within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
+    within = {name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()}
+    deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in imperfections.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
     all_loads = replace(_loads(case, modelled), own=tuple(term.turned(turn) for term in energies), contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"
     included, left_out = account(context, all_loads, model, plane, len(rims))
-    included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
+    included += [f"{key}: {flaw.account}" for key, flaw in imperfections.items() if flaw.account]
     sample = sample if len(sample) else drawn.sample()
     problem = Problem(
         context=context,
@@ -268,14 +268,14 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
     }
 
 
-def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
+def imperfect(perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
     """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have their cells."""
-    if not found:
+    if not imperfections:
         return perfect
-    circles = tuple(flaw.reach for flaw in found.values() if flaw.rim) if perfect.disc else ()
-    shown = min((flaw.size for flaw in found.values()), default=inf)
+    circles = tuple(flaw.reach for flaw in imperfections.values() if flaw.rim) if perfect.disc else ()
+    shown = min((flaw.size for flaw in imperfections.values()), default=inf)
     return perfect.deviated(
-        tuple(in_frame(found[key].deviation, turn) for key in found if key in still), circles, shown
+        tuple(in_frame(imperfections[key].deviation, turn) for key in imperfections if key in still), circles, shown
     )
 
 
@@ -311,8 +311,8 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         return True, None
     if isinstance(case.symmetry, int):
         places = [np.array(x) for x in case.points.values()]
-        if found := sector(parts, drawn, case.symmetry, places):
-            return False, found
+        if sector_of_waves := sector(parts, drawn, case.symmetry, places):
+            return False, sector_of_waves
         raise CaseError(
             f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
             f"angle of {180 / case.symmetry:g} degrees with all named points between them"
@@ -335,8 +335,8 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
 
     def chart(name: str, x: Array) -> Array:
         refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
-        found = drawn.inverse(Q @ x)
-        return drawn.on_half(found) if half else found
+        places = drawn.inverse(Q @ x)
+        return drawn.on_half(places) if half else places
 
     points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
     if points:

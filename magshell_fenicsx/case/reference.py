@@ -64,12 +64,12 @@ class _WithMeanings(GenerateJsonSchema):
     """Gives keys their docstrings, and sections the full names of their classes as titles."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
-        found = super().model_schema(schema)
-        found["title"] = f"{schema['cls'].__module__}.{schema['cls'].__qualname__}"
-        for key, value in found.get("properties", {}).items():
+        schema_of_model = super().model_schema(schema)
+        schema_of_model["title"] = f"{schema['cls'].__module__}.{schema['cls'].__qualname__}"
+        for key, value in schema_of_model.get("properties", {}).items():
             if words := meaning(schema["cls"], key):
                 value.setdefault("description", words)
-        return found
+        return schema_of_model
 
     def encode_default(self, dft: Any) -> Any:
         return super().encode_default(dft.model_dump(mode="json") if isinstance(dft, BaseModel) else dft)
@@ -108,7 +108,7 @@ def _apart(whole: Schema) -> Schema:
         sections[part["title"]] = inner
         return {"$ref": part["title"]}
 
-    found = named(whole)
+    with_names = named(whole)
     lifted = {name: named(section) for name, section in whole["$defs"].items()}
     others = {name: section for name, section in lifted.items() if f"#/$defs/{name}" not in titles}
     short = Counter(title.rsplit(".", 1)[-1] for title in sections)
@@ -127,7 +127,7 @@ def _apart(whole: Schema) -> Schema:
         }
 
     definitions = {names[title]: section for title, section in sections.items()} | others
-    return dict(shortened({**found, "$defs": dict(sorted(definitions.items()))}))
+    return dict(shortened({**with_names, "$defs": dict(sorted(definitions.items()))}))
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
@@ -155,19 +155,19 @@ def reference() -> str:
 
 def _places(whole: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
     """Section -> the keys that it stands under, in the order of the file."""
-    found: dict[str, list[str]] = {}
+    places: dict[str, list[str]] = {}
 
     def visit(part: Schema, path: str) -> None:
         named = {"NAME": part["additionalProperties"]} if part.get("additionalProperties") else {}
         for key, value in (part["properties"] | named).items():
             for name in _references(value):
-                here = f"{path}{key}"
-                if here not in found.setdefault(name, []):
-                    found[name].append(here)
-                    visit(sections[name], f"{here}.")
+                full_key = f"{path}{key}"
+                if full_key not in places.setdefault(name, []):
+                    places[name].append(full_key)
+                    visit(sections[name], f"{full_key}.")
 
     visit(whole, "")
-    return found
+    return places
 
 
 def _references(part: Any) -> Iterator[str]:
@@ -203,8 +203,8 @@ def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
 def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
     told = re.fullmatch(r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split()))
     assert told
-    known = part.get("default")
-    default = "**required**" if required else "" if isinstance(known, dict) or known is None else f"`{_plain(known)}`"
+    value = part.get("default")
+    default = "**required**" if required else "" if isinstance(value, dict) or value is None else f"`{_plain(value)}`"
     cells = (f"`{key}`", _allowed(part, titles), told[2] or "", default, told[1])
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 

@@ -202,12 +202,12 @@ class Several:
     @property
     def readers(self) -> dict[str, FileKeys]:
         """Their sections that read a file, by key."""
-        found = dict[str, FileKeys]()
+        by_key = dict[str, FileKeys]()
         for part in self.parts:
-            found |= {part.refused(key): section for key, section in part.case.readers.items()}
+            by_key |= {part.refused(key): section for key, section in part.case.readers.items()}
             if part.section.remanent and part.section.remanent.file:
-                found[part.refused("remanent")] = part.section.remanent
-        return found
+                by_key[part.refused("remanent")] = part.section.remanent
+        return by_key
 
     @property
     def _thicknesses(self) -> dict[str, float | None]:
@@ -287,8 +287,8 @@ def _case(name: str, data: Keys, context: Keys, case: "type[Case]") -> "Case":
         if isinstance(load, dict) and load.get("kind") == "indentation" and isinstance(load.get("at"), dict)
         if isinstance(at := load["at"].get("point"), str) and at.startswith((f"{name}.", f"{name}_"))
     ]
-    known = own["points"] if isinstance(own["points"], dict) else {}
-    forces = [force for force in forces if force["at"]["point"] in known]  # type: ignore[index]
+    own_points = own["points"] if isinstance(own["points"], dict) else {}
+    forces = [force for force in forces if force["at"]["point"] in own_points]  # type: ignore[index]
     steps = [*forces, *([{"kind": "pressure"}] if _presses(loading, name) else [])]  # what mesh sizes follow
     try:
         made = case.model_validate(
@@ -357,18 +357,18 @@ def _merged(parts: Sequence[Part]) -> Keys:
                     )
                 )
     unit = _unit if shell.with_units else (lambda value, unit: value)
-    found: Keys = {
+    of_first: Keys = {
         "radius": unit(shell.reference, "m"),
         "thickness": unit(shell.reference / shell.R_over_h, "m"),
         "poisson_ratio": shell.poisson_ratio,
         **({"unit": "m"} if shell.with_units else {}),
     }
     if shell.modulus is not None:
-        found["youngs_modulus"] = unit(shell.modulus, "Pa")
+        of_first["youngs_modulus"] = unit(shell.modulus, "Pa")
     if shell.density is not None:
-        found["density"] = unit(shell.density, "kg/m**3")
+        of_first["density"] = unit(shell.density, "kg/m**3")
     written = {key: getattr(shell, key) for key in IN_COMMON if key in shell.model_fields_set}
-    return found | written
+    return of_first | written
 
 
 def _unit(value: float, unit: str) -> Any:
@@ -377,13 +377,13 @@ def _unit(value: float, unit: str) -> Any:
 
 def _points(several: Several) -> dict[str, list[float]]:
     """Name -> place in the frame of the case."""
-    found = {}
+    places = {}
     for part in several.parts:
         place = part.section.place
         for name, x in part.section.points.items():
             at = place.Q @ np.array(x) + np.array(place.position)
-            found[f"{part.name}_{name}"] = [float(c) for c in at]
-    return found
+            places[f"{part.name}_{name}"] = [float(c) for c in at]
+    return places
 
 
 def _magnetised(magnetic: Any, several: Several) -> Any:

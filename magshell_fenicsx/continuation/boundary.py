@@ -272,10 +272,10 @@ class Boundary:
         sizes, changes = list[float](), list[float]()
         while True:
             newton = self.family.at(p)
-            system, here = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
+            system, latest = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
-                tangent = AugmentedTangent(newton, here, b)
-                lines = Lines(system, here, name, tangent, self.family, beside, self.scales)
+                tangent = AugmentedTangent(newton, latest, b)
+                lines = Lines(system, latest, name, tangent, self.family, beside, self.scales)
                 way = lines.step(self.kind, row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"

@@ -408,8 +408,8 @@ class _Search:
             return "the solution is a known one"
         return self._solver.exact(point, point)
 
-    def _is_known(self, found: State) -> bool:
-        away = (max_abs(self._system.comm, found.u - state.u) for state in self.known)
+    def _is_known(self, solution: State) -> bool:
+        away = (max_abs(self._system.comm, solution.u - state.u) for state in self.known)
         return min(away) <= COPY * self._system.length
 
 

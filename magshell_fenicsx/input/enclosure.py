@@ -72,9 +72,9 @@ def _multiply(a: Range, b: Range) -> Range:
 
 
 def _inverse(a: Range) -> Range:
-    found = Range(1 / a.high, 1 / a.low).unless(a.holds(0.0))
-    found = found.unless((a.low == 0) & (a.high > 0), high=np.inf, low=0.0)
-    return found.unless((a.high == 0) & (a.low < 0), low=-np.inf, high=0.0)
+    inverse = Range(1 / a.high, 1 / a.low).unless(a.holds(0.0))
+    inverse = inverse.unless((a.low == 0) & (a.high > 0), high=np.inf, low=0.0)
+    return inverse.unless((a.high == 0) & (a.low < 0), low=-np.inf, high=0.0)
 
 
 def _divide(a: Range, b: Range) -> Range:
@@ -141,8 +141,8 @@ def _sign(a: Range) -> Range:
 
 
 def _arctan2(y: Range, x: Range) -> Range:
-    found = y.hull(*(np.arctan2(v, u) for v in (y.low, y.high) for u in (x.low, x.high)))
-    return found.unless(_on_cut(y, x), -np.pi, np.pi)
+    angles = y.hull(*(np.arctan2(v, u) for v in (y.low, y.high) for u in (x.low, x.high)))
+    return angles.unless(_on_cut(y, x), -np.pi, np.pi)
 
 
 def _on_cut(y: Range, x: Range) -> NDArray[np.bool_]:

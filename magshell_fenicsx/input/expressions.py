@@ -131,12 +131,12 @@ class Read:
 
         The latter times the sides, summed.
         """
-        found, n = _evaluate(self.steps, *Enclosed.coordinates(low, high)), len(low)
-        if not isinstance(found, Enclosed):
-            return np.full(n, found), np.full(n, found), np.zeros(n)
-        sides, widths = 2 * found.halves, (slope.high - slope.low for slope in found.slopes)
+        enclosed, n = _evaluate(self.steps, *Enclosed.coordinates(low, high)), len(low)
+        if not isinstance(enclosed, Enclosed):
+            return np.full(n, enclosed), np.full(n, enclosed), np.zeros(n)
+        sides, widths = 2 * enclosed.halves, (slope.high - slope.low for slope in enclosed.slopes)
         bent = sum(np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True))
-        return (*np.broadcast_arrays(found.values.low, found.values.high), np.broadcast_to(bent, n))  # type: ignore[return-value]
+        return (*np.broadcast_arrays(enclosed.values.low, enclosed.values.high), np.broadcast_to(bent, n))  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -163,8 +163,8 @@ class Together:
         if self.frame is not None:
             middle, half = (low + high) / 2 @ self.frame, (high - low) / 2 @ np.abs(self.frame)
             low, high = middle - half, middle + half
-        found = [f.bounds(self.length * low, self.length * high) for f in self.functions]
-        return tuple(np.stack(each, axis=-1) for each in zip(*found, strict=True))
+        of_formulas = [f.bounds(self.length * low, self.length * high) for f in self.functions]
+        return tuple(np.stack(each, axis=-1) for each in zip(*of_formulas, strict=True))
 
 
 def together(functions: Sequence[object], frame: Array | None = None, length: float = 1.0) -> Together | None:
@@ -227,15 +227,15 @@ def _read(text: str) -> list[_Step]:
         raise ValueError(f"{said!r} is not a formula") from None
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
-        known = isinstance(node, _ALLOWED)
+        allowed = isinstance(node, _ALLOWED)
         if isinstance(node, ast.Constant):
-            known = isinstance(node.value, int | float) and not isinstance(node.value, bool)
+            allowed = isinstance(node.value, int | float) and not isinstance(node.value, bool)
         if isinstance(node, ast.Name):
-            known = node.id in (FUNCTIONS if id(node) in called else NAMES)
+            allowed = node.id in (FUNCTIONS if id(node) in called else NAMES)
         if isinstance(node, ast.Call):
             name = node.func.id if isinstance(node.func, ast.Name) else ""
-            known = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
-        if not known:
+            allowed = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
+        if not allowed:
             raise ValueError(f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}")
     return _steps(tree)
 
@@ -316,8 +316,8 @@ class ByFormula:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         x = np.moveaxis(self.length * r0 @ self.frame, -1, 0)
-        found = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
-        return found @ self.frame.T if self.vectors else found
+        values = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
+        return values @ self.frame.T if self.vectors else values
 
     @property
     def formulas(self) -> Together | None:
@@ -354,8 +354,8 @@ class FormulasInSpace:
     axes: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        found, Q = [component(x @ self.axes) for component in self.components], self.axes
-        B, G, H = (np.stack([getattr(f, d) for f in found]) for d in ("value", "gradient", "hessian"))
+        parts, Q = [component(x @ self.axes) for component in self.components], self.axes
+        B, G, H = (np.stack([getattr(f, d) for f in parts]) for d in ("value", "gradient", "hessian"))
         return (
             np.einsum("ai,in->na", Q, B),
             np.einsum("ai,bj,ijn->nab", Q, Q, G, optimize=True),

@@ -26,7 +26,7 @@ def meaning(section: type[BaseModel], key: str) -> str:
     field = section.model_fields.get(key)
     if field is not None and field.description:
         return field.description
-    return next((found for base in section.__mro__ if (found := _docstrings(base).get(key))), "")
+    return next((docstring for base in section.__mro__ if (docstring := _docstrings(base).get(key))), "")
 
 
 @cache
@@ -156,8 +156,8 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
 def _at(data: Any, location: Sequence[str | int], kind: type) -> Any:
     """The part of plain data at a location; an empty one if it is of another kind."""
     for key in location:
-        there = isinstance(data, dict) or (isinstance(data, list) and isinstance(key, int) and key < len(data))
-        data = data.get(key) if isinstance(data, dict) else data[key] if there else None
+        fits = isinstance(data, dict) or (isinstance(data, list) and isinstance(key, int) and key < len(data))
+        data = data.get(key) if isinstance(data, dict) else data[key] if fits else None
     return data if isinstance(data, kind) else kind()
 
 

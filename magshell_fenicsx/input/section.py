@@ -208,14 +208,14 @@ NAMES = {
 }  # keys with text that is no quantity
 
 
-def texts(part: Any, known: Callable[[str], bool] = lambda text: False, path: str = "") -> Iterator[str]:
+def texts(part: Any, is_other: Callable[[str], bool] = lambda text: False, path: str = "") -> Iterator[str]:
     """The keys of plain data whose numbers are text with a unit, without texts `known` to be something else."""
     for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
         if key in NAMES:
             continue
-        if isinstance(value, str) and not known(value):
+        if isinstance(value, str) and not is_other(value):
             yield f"{path}{key}"
-        yield from texts(value, known, f"{path}{key}.")
+        yield from texts(value, is_other, f"{path}{key}.")
 
 
 @dataclass(frozen=True)

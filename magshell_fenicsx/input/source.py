@@ -156,8 +156,8 @@ def override(source: Source, assignment: str) -> None:
     for i, key in enumerate(keys):
         if isinstance(section, list):
             if not key.isdecimal() or int(key) >= len(section):
-                there = f"items 0 to {len(section) - 1}" if section else "no items"
-                raise CaseError(f"--set {assignment}: {'.'.join(keys[: i + 1])}: the list has {there}")
+                allowed = f"items 0 to {len(section) - 1}" if section else "no items"
+                raise CaseError(f"--set {assignment}: {'.'.join(keys[: i + 1])}: the list has {allowed}")
         elif not isinstance(section, dict):
             raise CaseError(f"--set {assignment}: {keys[i - 1]} is a value, not a section")
         location.append(int(key) if isinstance(section, list) else key)

@@ -81,12 +81,12 @@ class Embedded:
         return all(size == CHART for _, size, _ in self.embeddings)
 
     def __call__(self, nodes: Array) -> Array:
-        number, found = np.rint(nodes[:, -1]), np.array(nodes[:, :3])
+        number, places = np.rint(nodes[:, -1]), np.array(nodes[:, :3])
         for i, (embedding, size, place) in enumerate(self.embeddings):
             of = number == i
             if of.any():
-                found[of] = place(embedding(nodes[of, 3 : 3 + size]))
-        return found
+                places[of] = place(embedding(nodes[of, 3 : 3 + size]))
+        return places
 
 
 @dataclass(eq=False)
@@ -264,8 +264,8 @@ def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tu
 
     def at(t: Array) -> Array:
         X = start[:, None] + t[..., None] * (end - start)[:, None]
-        found = patch.embedding(_in_cells(patch, np.repeat(cell, T), X.reshape(-1, 2)))
-        return np.asarray(found.reshape(S, T, 3))
+        places = patch.embedding(_in_cells(patch, np.repeat(cell, T), X.reshape(-1, 2)))
+        return np.asarray(places.reshape(S, T, 3))
 
     for _ in range(ROUNDS):
         off = targets[None] - at(t)

@@ -100,13 +100,13 @@ class Home:
                 "interpolate it into such a space"
             )
         element = V.element.basix_element
-        known = stored(element.degree)
-        table = element.tabulate(0, known.points)[0, :, :, 0]
+        nodes = stored(element.degree)
+        table = element.tabulate(0, nodes.points)[0, :, :, 0]
         values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
         nodal = self._gathered(np.matmul(table, np.asarray(values, dtype=float)))
         if not np.isfinite(nodal).all():
             raise MeshError(f"{name}: has values that are not numbers")
-        return GivenField(name, element.degree, nodal, swapped(known), self)
+        return GivenField(name, element.degree, nodal, swapped(nodes), self)
 
     def displacement(self, u: fem.Function, given: Numbers, scale: float) -> fem.Function:
         """A field of a scene as a function on this mesh.
@@ -130,9 +130,9 @@ class Home:
             whole[numbers] = values
         W = self._spaces.get(degree) or fem.functionspace(self.mesh, ("Lagrange", degree, (3,)))
         self._spaces[degree] = W
-        found = fem.Function(W, name="u")
-        found.x.array.reshape(-1, 3)[W.dofmap.list] = whole[self._numbers]
-        return found
+        displacement = fem.Function(W, name="u")
+        displacement.x.array.reshape(-1, 3)[W.dofmap.list] = whole[self._numbers]
+        return displacement
 
     def _original(self, cells: Any) -> Numbers:
         """The number of each local cell, ghosts included, in the order in which all were made."""
@@ -146,8 +146,8 @@ class Home:
     def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values of this rank's own cells, of all ranks in their order."""
         parts = self.comm.allgather((self._numbers[: self._owned], values))
-        numbers, found = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return np.asarray(found[np.argsort(numbers)])
+        numbers, all_values = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return np.asarray(all_values[np.argsort(numbers)])
 
     def _places(self) -> tuple[Array, Numbers]:
         """Coordinates (cells, nodes, 3) and global numbers of the nodes of this rank's own cells, in gmsh's order."""
@@ -170,31 +170,31 @@ class Home:
             On every rank, if there are none on any, or what one rank has is of no part of this mesh.
         """
         what, named = ("facet_tags", "facets") if dimension == 1 else ("cell_tags", "cells")
-        found: NDArray[np.int32] = np.empty(0, dtype=np.int32)
+        chosen: NDArray[np.int32] = np.empty(0, dtype=np.int32)
         said = ""
         by_value = isinstance(part, int | np.integer)
         if not by_value:
             said = self._strange(np.asarray(part), dimension, named)
-            found = found if said else np.asarray(part, dtype=np.int32)
+            chosen = chosen if said else np.asarray(part, dtype=np.int32)
         elif tags is None or tags.dim != dimension:
             said = f"is a value of tags: give {what}"
         elif not compat.tags_of(tags, self.mesh):
             said = f"{what} belong to another mesh than that of the shell"
         else:
-            found = np.asarray(tags.find(part))
+            chosen = np.asarray(tags.find(part))
         if wrong := next(filter(None, self.comm.allgather(said)), ""):
             raise MeshError(f"{key}: {part}: {wrong}" if by_value else f"{key}: {wrong}")
         values = [] if tags is None else np.unique(tags.values)
-        there = sorted({int(value) for each in self.comm.allgather(values) for value in each})
-        if not self.comm.allreduce(len(found)) and by_value:
-            raise MeshError(f"{key}: {part}: {what} have no such value, only {', '.join(map(str, there)) or 'none'}")
-        return found
+        allowed = sorted({int(value) for each in self.comm.allgather(values) for value in each})
+        if not self.comm.allreduce(len(chosen)) and by_value:
+            raise MeshError(f"{key}: {part}: {what} have no such value, only {', '.join(map(str, allowed)) or 'none'}")
+        return chosen
 
     def _strange(self, numbers: NDArray[Any], dimension: int, named: str) -> str:
         """What is wrong with local numbers of facets or cells on this rank; empty if nothing is."""
         self.mesh.topology.create_entities(dimension)
-        there = self.mesh.topology.index_map(dimension)
-        count = there.size_local + there.num_ghosts
+        entities = self.mesh.topology.index_map(dimension)
+        count = entities.size_local + entities.num_ghosts
         if numbers.ndim != 1 or (len(numbers) and numbers.dtype.kind not in "iu"):
             hint = ": np.flatnonzero(...) of a mask" if numbers.dtype.kind == "b" else ""
             return f"is neither a value of tags nor a list of local numbers of {named}{hint}"
@@ -207,16 +207,16 @@ class Home:
         for dimensions in ((1, 2), (1, 0), (2, 1)):
             topology.create_connectivity(*dimensions)
         ends = mesh.entities_to_geometry(self.mesh, 1, facets)[:, :2] if len(facets) else np.empty((0, 2), np.int32)
-        known = self.mesh.geometry.index_map().local_to_global(np.asarray(ends, dtype=np.int32).ravel())
-        pairs = np.concatenate(self.comm.allgather(np.asarray(known, dtype=np.int64).reshape(-1, 2)))
+        numbers = self.mesh.geometry.index_map().local_to_global(np.asarray(ends, dtype=np.int32).ravel())
+        pairs = np.concatenate(self.comm.allgather(np.asarray(numbers, dtype=np.int64).reshape(-1, 2)))
         return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
 
     def _among(self, cells: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
         """Whether each cell of all ranks is among these local ones."""
-        found = np.zeros(count, dtype=bool)
+        among = np.zeros(count, dtype=bool)
         for numbers in self.comm.allgather(self._numbers[cells]):
-            found[numbers] = True
-        return found
+            among[numbers] = True
+        return among
 
 
 def stored(degree: int) -> basix.finite_element.FiniteElement:

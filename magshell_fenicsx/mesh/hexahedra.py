@@ -321,5 +321,5 @@ def face_measure(domain: mesh.Mesh, parts: Sequence[NDArray[np.int32]]) -> ufl.M
     facets = np.concatenate(parts)
     tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
     order = np.argsort(facets)
-    found = mesh.meshtags(domain, 2, facets[order], tags[order])
-    return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})
+    tagged = mesh.meshtags(domain, 2, facets[order], tags[order])
+    return ufl.Measure("ds", domain=domain, subdomain_data=tagged, metadata={"quadrature_degree": WHOLE})

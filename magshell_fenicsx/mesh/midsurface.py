@@ -170,9 +170,9 @@ class Midsurface:
 
     def function(self, field: GivenField) -> fem.Function:
         """The same as a function on this mesh, of the shape (size,)."""
-        found = fem.Function(fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name)
-        found.x.array.reshape(-1, field.size)[found.function_space.dofmap.list] = self.in_cells(field)
-        return found
+        f = fem.Function(fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name)
+        f.x.array.reshape(-1, field.size)[f.function_space.dofmap.list] = self.in_cells(field)
+        return f
 
     @property
     def _original_cells(self) -> NDArray[np.int64]:

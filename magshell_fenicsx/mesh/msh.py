@@ -219,9 +219,9 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     """
     if isinstance(file.given, Assembly):
         patch = file.given.patch
-        known = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
-        others = {name: x for name, x in points.items() if name not in known}
-        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale), **known})
+        on_alike = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
+        others = {name: x for name, x in points.items() if name not in on_alike}
+        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale), **on_alike})
     try:
         patch = _whole(file)
     except MeshError as e:
@@ -319,13 +319,13 @@ def _content(file: MeshFile) -> Triangles:
 
 
 def _elements(
-    file: MeshFile, held: Content, dimension: int, known: Collection[str]
+    file: MeshFile, held: Content, dimension: int, passed_over: Collection[str]
 ) -> list[tuple[int, NDArray[np.int64]]]:
     """Entity and nodes of the blocks of one dimension."""
     blocks = []
     for name, dim, entity, nodes in held.blocks:
         if dim == dimension:
-            if name not in known:
+            if name not in passed_over:
                 raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
             blocks.append((entity, nodes))
     return blocks

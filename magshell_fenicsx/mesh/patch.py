@@ -109,10 +109,10 @@ class GivenField:
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for each in arrays:
-        found.update(str((each.dtype, each.shape)).encode() + np.ascontiguousarray(each).tobytes())
-    return found.hexdigest()
+        digest.update(str((each.dtype, each.shape)).encode() + np.ascontiguousarray(each).tobytes())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

@@ -94,17 +94,17 @@ def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Arra
 
 def _smaller(size: Size, places: Array) -> Size:
     """Half the size at places (n, 2), growing from there."""
-    there = np.array([size(x) / 2 for x in places])
-    return lambda x: min(size(x), float((there + GROWTH * np.hypot(*(places - x).T)).min()))
+    halved = np.array([size(x) / 2 for x in places])
+    return lambda x: min(size(x), float((halved + GROWTH * np.hypot(*(places - x).T)).min()))
 
 
 def _with_images(shape: Shape, points: Mapping[str, Array]) -> list[Array]:
     """The points, each once, and on glued sides their images on the other one."""
     places = list(points.values())
     for axis, low, high in shape.glued:
-        for here, there in ((low, high), (high, low)):
-            for x in [x for x in places if abs(x[axis] - here) < CLOSE]:
-                places.append(np.where(np.arange(2) == axis, there, x))
+        for side, image in ((low, high), (high, low)):
+            for x in [x for x in places if abs(x[axis] - side) < CLOSE]:
+                places.append(np.where(np.arange(2) == axis, image, x))
     return list(np.unique(np.round(places, 12), axis=0)) if shape.glued else places
 
 

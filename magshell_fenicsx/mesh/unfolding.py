@@ -59,16 +59,16 @@ class Folding:
 
     def back(self, chart: Array) -> Array:
         """The places of the sector whose copies these are."""
-        found, copies = np.empty_like(chart), self.copies(chart)
+        places, copies = np.empty_like(chart), self.copies(chart)
         for k in range(self.count):
-            here = copies == k
+            of_copy = copies == k
             if self.round:
-                found[here] = chart[here] @ self.turn(k)[:2, :2]
+                places[of_copy] = chart[of_copy] @ self.turn(k)[:2, :2]
             else:
-                x = chart[here, 0]
-                found[here, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
-                found[here, 1] = chart[here, 1]
-        return found
+                x = chart[of_copy, 0]
+                places[of_copy, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
+                places[of_copy, 1] = chart[of_copy, 1]
+        return places
 
 
 def unfolded(patch: PatchMesh, folding: Folding, ends: tuple[str, str]) -> PatchMesh:

@@ -306,8 +306,8 @@ def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
         fewer = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
-        found = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
-        return np.asarray(np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], found, inf).min(axis=(1, 2)))
+        needed = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
+        return np.asarray(np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], needed, inf).min(axis=(1, 2)))
 
     return sizes
 

@@ -296,10 +296,10 @@ class RunFiles:
             by_first(self._comm, listed)
 
 
-def _same(row: Row, there: dict[str, str]) -> None:
+def _same(row: Row, kept: dict[str, str]) -> None:
     """Check that a recomputed point equals the one in path.csv."""
-    same = row["label"] == there["label"] and all(
-        math.isclose(float(row[key]), float(there[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
+    same = row["label"] == kept["label"] and all(
+        math.isclose(float(row[key]), float(kept[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
     )
     if not same:
         raise CaseError(

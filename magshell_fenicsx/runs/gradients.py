@@ -61,21 +61,21 @@ def gradients_after(result: Result, folder: Path, say: Say) -> None:
     for of in section.of if section else []:
         assert section
         try:
-            kind, found = _adjoint(result, of)
-            slopes = {by: derivative(found, by) for by in section.by}
+            kind, adjoint = _adjoint(result, of)
+            slopes = {by: derivative(adjoint, by) for by in section.by}
         except (CaseError, FoldLost, Lost) as e:
             say(f"warning: no gradient of {of}: {e}")
             continue
         fields = {by: each for by, each in slopes.items() if isinstance(each, FieldGradient)}
         numbers = {by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)}
-        scene = found.scene  # that of the end, which may be of another model
+        scene = adjoint.scene  # that of the end, which may be of another model
         told: dict[str, dict[str, Any]] = {by: {"alike": _alike(scene, by, each)} for by, each in fields.items()}
         if fields:
-            drawn = _surface(scene, found, fields)
+            drawn = _surface(scene, adjoint, fields)
             for by, most in scene.comm.bcast(drawn and {by: _most(drawn, by) for by in fields}).items():
                 told[by] |= most
             by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
-        result.gradients[of] = {"value": found.shown, "kind": kind, "numbers": numbers, "fields": told}
+        result.gradients[of] = {"value": adjoint.shown, "kind": kind, "numbers": numbers, "fields": told}
         for by, v in told.items():
             alike, place = _words(v["alike"], v["most_per_area"], 6), _words(v["at"], 1.0, 3)
             say(f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})")
@@ -105,9 +105,9 @@ def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
     return adjoint_at_end(scene, history, of)
 
 
-def _alike(scene: Scene, by: str, found: FieldGradient) -> list[float]:
+def _alike(scene: Scene, by: str, gradient: FieldGradient) -> list[float]:
     """By a field that changes alike everywhere, of vectors in the case's frame; of a meridian along e_rho, e_z."""
-    total = found.within(np.ones(len(found.forces), dtype=bool))
+    total = gradient.within(np.ones(len(gradient.forces), dtype=bool))
     if by == "remanence":
         total = total[[0, 2]] if scene.problem.meridian else total @ rotation(scene.problem.azimuth)
     return [float(v) for v in total]
@@ -120,7 +120,7 @@ def _most(drawn: Surface, by: str) -> dict[str, Any]:
     return {"most_per_area": float(sizes[place]), "at": [float(x) for x in drawn.r0[place]]}
 
 
-def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) -> Surface | None:
+def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]) -> Surface | None:
     """The whole deformed shell with the densities as its fields, on rank 0; collective."""
     gathering, model, drawn = gatherer(scene.model, scene.comm), scene.model, dict[str, Array | None]()
     width = model.V.dofmap.bs
@@ -134,7 +134,7 @@ def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) 
             vectors[:, -1] = values[:, i]
             along = _at_nodes(scene, gathering, vectors)
             drawn[name] = None if along is None else along[:, 2]
-    base = gathering.gather(found.state.u)
+    base = gathering.gather(adjoint.state.u)
     if base is None:
         return None
     surface = replace(base, fields={name: v for name, v in drawn.items() if v is not None})
@@ -146,5 +146,5 @@ def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) 
 
 def _at_nodes(scene: Scene, gathering: Gatherer, values: Array) -> Array | None:
     """Vectors at this rank's nodes as those at all nodes that are drawn, on rank 0; collective."""
-    found = gathering.gather(values.ravel()[: scene.model.system.size])
-    return found.u if found else None
+    gathered = gathering.gather(values.ravel()[: scene.model.system.size])
+    return gathered.u if gathered else None

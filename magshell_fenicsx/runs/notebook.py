@@ -41,8 +41,8 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
-    found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return turned(whole(found, problem.mirror) if problem.mirror else found, problem.azimuth) if found else None
+    base = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
+    return turned(whole(base, problem.mirror) if problem.mirror else base, problem.azimuth) if base else None
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
@@ -51,8 +51,8 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
     `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
     `plot(scalars="w_over_h")` shows it, after `off_screen()` also where there is no display.
     """
-    found = surface(scene, record)
-    return _smooth(found, scene.problem.material.h) if found else None
+    drawn = surface(scene, record)
+    return _smooth(drawn, scene.problem.material.h) if drawn else None
 
 
 def off_screen() -> None:
@@ -99,11 +99,11 @@ def picture(
     """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields."""
     if of not in PICTURES:
         raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
-    found = surface(scene, record)
-    if found is None:
+    drawn_surface = surface(scene, record)
+    if drawn_surface is None:
         return None
     style = scene.problem.output
-    drawn = figures(found, scene.problem.material.h, style, run_camera(found, style), [of])
+    drawn = figures(drawn_surface, scene.problem.material.h, style, run_camera(drawn_surface, style), [of])
     return _in_line(drawn[of]) if drawn else None
 
 
@@ -122,8 +122,8 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
     drawn, place = rows(scene, records), pole_of(scene.problem.document.data)
     axes = axes_of(varied, drawn[0])
     if not all(axis.name in drawn[0] for axis in axes):
-        there = ", ".join(dict.fromkeys(record.amplitude for record in records if record.amplitude))
-        raise ValueError(f"curve: {varied}: the scene has no such amplitude; these records vary {there or 'none'}")
+        amplitudes = ", ".join(dict.fromkeys(record.amplitude for record in records if record.amplitude))
+        raise ValueError(f"curve: {varied}: the scene has no such amplitude; these records vary {amplitudes or 'none'}")
     return _in_line(curve_figure(drawn, varied, scene.problem.output, place))
 
 

@@ -67,11 +67,11 @@ class RowMaker:
         return {**self._clock, **own, "stored": stored}
 
 
-def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length: float) -> Iterator[str]:
+def imbalances(programme: Iterable[ProgrammeStep], rows: Sequence[Row], length: float) -> Iterator[str]:
     """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
     for step in programme:
         over = step.load.motion.balance if step.load.motion else BALANCE
-        parts = [_imbalance(row, length) for row in found if row["step"] == step.number and row.get("imbalance")]
+        parts = [_imbalance(row, length) for row in rows if row["step"] == step.number and row.get("imbalance")]
         if parts and abs(worst := max(parts, key=abs)) > over:
             yield (
                 f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
@@ -80,12 +80,12 @@ def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length:
             )
 
 
-def departures(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iterator[str]:
+def departures(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> Iterator[str]:
     """Which motions have, or may have, a larger error than their tolerance, in words."""
     for step in programme:
         load = step.load
         how = load.motion or load.released_by
-        rows = [row for row in found if row["step"] == step.number and row["amplitude"] == "time"]
+        rows = [row for row in all_rows if row["step"] == step.number and row["amplitude"] == "time"]
         if how is None or not rows:
             continue
         error = max(float(row["error_over_h"]) for row in rows)
@@ -136,9 +136,9 @@ class Table(dict[str, NDArray[np.generic]]):
         return pandas.DataFrame(dict(self))
 
 
-def table(found: Sequence[Row], extra: Iterable[str]) -> Table:
+def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
     """The columns of rows, those of every run and extra ones."""
-    return Table({name: np.array([row[name] for row in found]) for name in (*COLUMNS, *extra)})
+    return Table({name: np.array([row[name] for row in rows]) for name in (*COLUMNS, *extra)})
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> Table:
@@ -146,6 +146,6 @@ def columns(scene: Scene, records: Iterable[Record]) -> Table:
 
     Collective.
     """
-    found = table(rows(scene, records), scene.extra_columns)
-    del found["wall_s"]
-    return found
+    by_name = table(rows(scene, records), scene.extra_columns)
+    del by_name["wall_s"]
+    return by_name

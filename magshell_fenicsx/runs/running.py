@@ -131,8 +131,8 @@ class Stoppable:
             self._watch.check()
         return kept
 
-    def record(self, found: Point | str) -> None:
-        self._journal.record(found)
+    def record(self, result: Point | str) -> None:
+        self._journal.record(result)
 
     def begin(self, space: object) -> None:
         self._journal.begin(space)
@@ -250,8 +250,8 @@ def _run(
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
     if interrupted:
-        there = files is not None and files.journal is not None
-        hint = f"; the results so far are in {folder}/, and --resume continues from there" if there else ""
+        resumable = files is not None and files.journal is not None
+        hint = f"; the results so far are in {folder}/, and --resume continues from there" if resumable else ""
         result.stopped = f"{interrupted}{hint}"
     return result
 
@@ -268,9 +268,9 @@ def _mesh_for_tolerance(problem: Problem, folder: Path | None, comm: MPI.Comm, s
     if problem.mesh.tolerance is None:
         return None
     file = folder / MESH if folder else None
-    if file and (known := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
+    if file and (saved := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
         try:
-            return Adapted.from_json(problem, known)
+            return Adapted.from_json(problem, saved)
         except (ValueError, KeyError, TypeError, IndexError) as e:
             raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     try:

@@ -91,7 +91,7 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     return Aim(own if own in scene.extra_columns else target.column, value / in_h)
 
 
-def time_left(begun: tuple[float, float], here: tuple[float, float]) -> float | None:
+def time_left(begun: tuple[float, float], now: tuple[float, float]) -> float | None:
     """Seconds to the end at the average speed so far; None if nothing or everything is done.
 
     Parameters
@@ -104,8 +104,8 @@ def time_left(begun: tuple[float, float], here: tuple[float, float]) -> float | 
     >>> time_left((0.0, 10.0), (0.25, 20.0))
     30.0
     """
-    done, taken = here[0] - begun[0], here[1] - begun[1]
-    return taken * (1 - here[0]) / done if done > 0 and here[0] < 1 else None
+    done, taken = now[0] - begun[0], now[1] - begun[1]
+    return taken * (1 - now[0]) / done if done > 0 and now[0] < 1 else None
 
 
 def clock(seconds: float) -> str:

@@ -268,14 +268,14 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
 
 def solutions(result: Result) -> list[dict[str, Any]]:
     """What searches have found; the residual is over the sum of the sizes of all terms' forces. Collective."""
-    found = []
+    entries = []
     for number, state in result.found.items():
         row, system = result.rows[number], result.scene_of(number).model.system
         residual = system.residual(state.u, state.mu)
         forces = (factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name) for t in system.terms)
         sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
         keys = ("p_over_pc", "w_over_h", "w_pole_over_h", "volume_change", "energy", "negative_pivots")
-        found.append(
+        entries.append(
             {
                 "point": number,
                 "step": row["step"],
@@ -286,7 +286,7 @@ def solutions(result: Result) -> list[dict[str, Any]]:
                 "residual": sizes[0] / sum(sizes[1:]),
             }
         )
-    return found
+    return entries
 
 
 def _told(row: Row) -> set[str]:

@@ -56,7 +56,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
 
 def lines_on(mirror: Mirror, grid: Grid, embedding: Embedding) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Coordinates of the grid lines, of either axis, that lie in a mirror plane within the chart."""
-    t, found = np.linspace(0, 1, 9), []
+    t, lines = np.linspace(0, 1, 9), []
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
     for axis in range(2):
         on = []
@@ -65,8 +65,8 @@ def lines_on(mirror: Mirror, grid: Grid, embedding: Embedding) -> tuple[tuple[fl
             chart[:, axis], chart[:, 1 - axis] = share, t
             if np.abs(mirror.beyond(embedding(low + chart * extent))).max() < ROUNDING:
                 on.append(float(low[axis] + share * extent[axis]))
-        found.append(tuple(on))
-    return found[0], found[1]
+        lines.append(tuple(on))
+    return lines[0], lines[1]
 
 
 def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -> list[Mirror]:
@@ -136,7 +136,7 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
         return None
     lost = {}
     for name, lines in patch.edges.items():
-        other = next((o for o, there in patch.edges.items() if _same_rows(image[lines], there)), None)
+        other = next((o for o, pairs in patch.edges.items() if _same_rows(image[lines], pairs)), None)
         if other is None:
             return None
         if other != name and mirror.beyond(nodes[lines]).mean() < 0:

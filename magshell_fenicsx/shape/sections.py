@@ -71,8 +71,8 @@ class MeshSurface(FileKeys, SurfaceSection):
     @property
     def assembly(self) -> Assembly | None:
         """The several shells for which it stands."""
-        known = self.files.given.get(self.path)
-        return known if isinstance(known, Assembly) else None
+        given = self.files.given.get(self.path)
+        return given if isinstance(given, Assembly) else None
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface

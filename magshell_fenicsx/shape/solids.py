@@ -47,8 +47,8 @@ class Solid:
     def creases(self) -> list[Array]:
         """Lines (2, 3) where faces end."""
         sides = np.sort(np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
-        found, count = np.unique(sides, axis=0, return_counts=True)
-        return [self.points[pair] for pair in found[count == 1] if np.ptp(self.points[pair], axis=0).max() > 0]
+        edges, count = np.unique(sides, axis=0, return_counts=True)
+        return [self.points[pair] for pair in edges[count == 1] if np.ptp(self.points[pair], axis=0).max() > 0]
 
 
 def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:

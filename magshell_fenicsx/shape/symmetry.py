@@ -112,8 +112,8 @@ def sector(parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vect
         return None
     beside = [a for part in parts for a in part.azimuths] + [atan2(x[1], x[0]) for x in places if tilted(x)]
     begins = [a + turn for a in (azimuth, *beside) for turn in (0.0, -pi / waves, pi)]
-    found = (Sector.at(begin, waves) for begin in begins)
-    return next((s for s in found if all(part.mirrors(side) for part in parts for side in s.sides.values())), None)
+    sectors = (Sector.at(begin, waves) for begin in begins)
+    return next((s for s in sectors if all(part.mirrors(side) for part in parts for side in s.sides.values())), None)
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:
@@ -178,8 +178,8 @@ def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) ->
     return alike(of(*(length * x).T), of(*(length * mirror.image(x)).T))
 
 
-def alike(here: Array, there: Array) -> bool:
+def alike(a: Array, b: Array) -> bool:
     """Equal to rounding, and finite."""
-    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return False
-    return bool((np.abs(here - there) <= ROUNDING * np.abs(here).max(initial=0.0)).all())
+    return bool((np.abs(a - b) <= ROUNDING * np.abs(a).max(initial=0.0)).all())

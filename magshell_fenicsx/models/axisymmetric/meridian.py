@@ -67,10 +67,10 @@ class Meridian:
 
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement in the same space."""
-        s, found = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
+        s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
         assert isinstance(self.embedding, Deviated)
-        found.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[:, [0, 2]].ravel()
-        return found
+        growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[:, [0, 2]].ravel()
+        return growth
 
 
 def make_meridian(
@@ -153,10 +153,10 @@ def graded_vertices(
     def size(s: Array) -> Array:
         if everywhere is not None:
             return np.full_like(s, everywhere / refinement)
-        found = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
+        sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
         if pressed:
-            found = np.minimum(found, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
-        return found
+            sizes = np.minimum(sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
+        return sizes
 
     corners = [0.0, *sorted({circle for circle in circles if circle < end}), end]
     return _equidistributed(corners, size)

@@ -52,9 +52,9 @@ class WavePoints:
         for e in energies:
             places.setdefault(_place(e), []).append(e)
         self._sites = [
-            _Site(carrier, u, batch, there, log)
-            for there in places.values()
-            for batch in _batches(carrier, there[0].density)
+            _Site(carrier, u, batch, at_place, log)
+            for at_place in places.values()
+            for batch in _batches(carrier, at_place[0].density)
         ]
         nodes = [site.nodes(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
@@ -95,7 +95,7 @@ class _Site:
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [parameters_at(points, e.density.parameters, sides) for e in energies if e.density]
         self._varying = [
-            [(here, on_batches(field, [batch], sides)) for here, field in varying] for _, varying in self._given
+            [(target, on_batches(field, [batch], sides)) for target, field in varying] for _, varying in self._given
         ]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
@@ -112,8 +112,8 @@ class _Site:
         fill(self._at_u, self._derivatives(self._u))
         self._placed.renew()
         for number in present:
-            for here, values in self._varying[number]:
-                fill(here, values.renew()[0])
+            for target, values in self._varying[number]:
+                fill(target, values.renew()[0])
         upper = np.zeros((len(waves), *self._scales.shape))
         for which, m in enumerate(waves):
             self._m.value = m
@@ -140,7 +140,7 @@ class _Site:
             [revolved_by(self._of_sides(field, PLANE, side)) for side in self._sides]
             for field in (self._at_u, self._at_r0, self._drawn)
         )
-        found = []
+        kernels = []
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert e.density
             start, shift = (drawn, [a - b for a, b in zip(r0, drawn, strict=True)]) if self._is_drawn(e) else (r0, None)
@@ -149,8 +149,8 @@ class _Site:
             for part in range(2):  # the cosine's and the sine's
                 v = [each[part] for each in both]
                 W = W + _added(e.density, start, moved, v, self._edge(r0), parameters)
-            found.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log, MPI.COMM_SELF))
-        return found
+            kernels.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log, MPI.COMM_SELF))
+        return kernels
 
     def _is_drawn(self, e: Energy) -> bool:
         return e.drawn and self._carrier.drawn is not None

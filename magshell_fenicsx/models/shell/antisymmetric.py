@@ -43,10 +43,10 @@ def antisymmetric_edge(
     def mirrored(a: Expr) -> Expr:
         return a - 2 * ufl.dot(a, mirror) * mirror
 
-    def jump(here: Jet, there: Jet) -> Expr:
-        outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (here, there))
+    def jump(inner: Jet, outer: Jet) -> Expr:
+        outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (inner, outer))
         r_nu = (outward - mirrored(inward)) / 2
-        return -ufl.dot(mirrored(kin.normal(there)) - kin.normal(here), r_nu)
+        return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
 
     sides = (u + v, u - v)
     J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)

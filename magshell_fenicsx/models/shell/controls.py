@@ -66,11 +66,11 @@ class ByControls:
     def __call__(self, r0: Array, n0: Array) -> Array:
         x = np.asarray(r0.reshape(-1, 3))
         x = x if self.frame is None else x @ self.frame
-        found: Array = np.asarray(self.controls.weights(x) @ self.values)
+        vectors: Array = np.asarray(self.controls.weights(x) @ self.values)
         if self.controls.around:
             rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
-            found = np.column_stack([found[:, :1] * x[:, :2] / rho, found[:, 1]])
-        return np.asarray(found if self.frame is None else found @ self.frame.T).reshape(r0.shape)
+            vectors = np.column_stack([vectors[:, :1] * x[:, :2] / rho, vectors[:, 1]])
+        return np.asarray(vectors if self.frame is None else vectors @ self.frame.T).reshape(r0.shape)
 
     def pulled(self, r0: Array, forces: Array) -> Array:
         """The transposed map: what multiplies each of the values in sum(forces . B) over places (cells, nodes, 3)."""

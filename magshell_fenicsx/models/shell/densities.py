@@ -87,8 +87,8 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
     `law` is `magnetic`, or has R in place of F.
     """
 
-    def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr, **known: Any) -> Expr:
-        return law(r0, u, Br, ufl.dot(G, r0.r + u.r), **known) - ufl.dot(ufl.dot(G, u.r), Br)
+    def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr, **options: Any) -> Expr:
+        return law(r0, u, Br, ufl.dot(G, r0.r + u.r), **options) - ufl.dot(ufl.dot(G, u.r), Br)
 
     return magnetic_gradient
 
@@ -96,9 +96,9 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
 def in_space(law: MagneticDensity) -> MagneticDensity:
     """That of a field known by values, of (r0, u, Br, P): P as of `applied.around`; `law` as above."""
 
-    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **known: Any) -> Expr:
+    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **options: Any) -> Expr:
         B, change = around(P, u.r)
-        return law(r0, u, Br, B, **known) - ufl.dot(change, Br)
+        return law(r0, u, Br, B, **options) - ufl.dot(change, Br)
 
     return magnetic_in_space
 

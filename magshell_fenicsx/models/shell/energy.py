@@ -106,8 +106,8 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density per undeformed area, per area of the coordinates."""
 
-    def of(r0: Jet, *rest: Any, **known: Any) -> Expr:
-        return density(r0, *rest, **known) * kin.area_ratio(r0)
+    def of(r0: Jet, *rest: Any, **options: Any) -> Expr:
+        return density(r0, *rest, **options) * kin.area_ratio(r0)
 
     return of
 
@@ -180,7 +180,7 @@ class HessianTerm:
         compat.add_matrix(K, self.tangent_form, clamped)
 
 
-def constants_of(term: OwnTerm, domain: mesh.Mesh, known: Constants) -> tuple[fem.Constant | fem.Function, ...]:
+def constants_of(term: OwnTerm, domain: mesh.Mesh, constants: Constants) -> tuple[fem.Constant | fem.Function, ...]:
     """The parameters of a term as constants; a free one has the same constant in all terms, kept in `known`.
 
     Raises
@@ -194,7 +194,7 @@ def constants_of(term: OwnTerm, domain: mesh.Mesh, known: Constants) -> tuple[fe
 
     def made(p: float | NDArray[np.float64] | Free | GivenField | ByPlace | Coefficient) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
-            return known.setdefault(p.name, constant(p.value))
+            return constants.setdefault(p.name, constant(p.value))
         if isinstance(p, Coefficient) and p.ufl_function_space().ufl_domain() == domain.ufl_domain():
             return p
         if isinstance(p, Coefficient | GivenField):

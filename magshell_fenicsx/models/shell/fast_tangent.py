@@ -99,17 +99,17 @@ class FastTangent:
 
     def times(self, v: Array, factors: Mapping[str, float]) -> Array:
         """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
-        found, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
+        product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         same = np.zeros(self._same.shape)
         for site in self._near:
 
             def couple(batch: int, K: Array, site: TangentSite = site) -> None:
-                here, there = (self._nodes[cells] for cells in site.coupling[batch].cells)
-                add_coupled(found, K, here, there, x)
+                first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)
+                add_coupled(product, K, first, second, x)
 
             site.add(self._u.x.array, factors, same, couple)
-        add_own(found, same[self._moving], self._nodes[self._moving], x)  # others have no node that moves
-        return found.ravel()
+        add_own(product, same[self._moving], self._nodes[self._moving], x)  # others have no node that moves
+        return product.ravel()
 
     def _couple(self, first: int, batch: int, K: Array) -> None:
         self._matrix.add_coupling(first + batch, K)
@@ -128,17 +128,17 @@ def make_sites(
     `chosen` are the local cells that count, with their edges; None for all.
     """
     V = r0.function_space
-    found = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
-    cells = [t for t in found if t.density.facets is None and t.density.sides == 1]
-    interior = [t for t in found if t.density.sides == 2]
+    nonlinear = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
+    cells = [t for t in nonlinear if t.density.facets is None and t.density.sides == 1]
+    interior = [t for t in nonlinear if t.density.sides == 2]
     sites = []
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
-        here = [t for t in cells if t.density.quadrature == rule]
+        of_rule = [t for t in cells if t.density.quadrature == rule]
         batches = cell_batches(V, rule or cell_quadrature(degree), chosen)
-        sites.append(Site(r0, batches, 1, here, log, None if rule else prestress))
+        sites.append(Site(r0, batches, 1, of_rule, log, None if rule else prestress))
     if interior:
         sites.append(Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log))
-    for term in found:
+    for term in nonlinear:
         if term.density.facets is not None:
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, chosen)
             sites.append(Site(r0, batches, 1, [term], log))

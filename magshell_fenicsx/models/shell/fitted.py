@@ -159,8 +159,8 @@ def fitted(
     chosen = np.flatnonzero((off @ w > SMOOTH * largest * w.sum()) | (hidden > PART * size))
     ahead = narrow.parts(chosen, parts)
     space = basix.create_element(basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped)
-    found = _moments(values, cells, chosen, scale, ahead, PART * size, space, nodal.shape[-1])
-    moments, sizes[chosen], squares, missed = found
+    integrals = _moments(values, cells, chosen, scale, ahead, PART * size, space, nodal.shape[-1])
+    moments, sizes[chosen], squares, missed = integrals
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
@@ -247,19 +247,19 @@ def _narrow(values: Values, formulas: Together, cells: Cells, coarse: Array) -> 
         return x, (area * w).sum(axis=1)
 
     first = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(np.arange(len(cells.nodal)))
-    found = leaves(formulas, first, look, lattice, cells.owned, cells.comm)
+    seen = leaves(formulas, first, look, lattice, cells.owned, cells.comm)
     deep = np.zeros(len(cells.nodal), bool)
-    divided = np.abs(found.parts.sides[:, 0]) < 1
-    deep[found.parts.cell[divided]] = True
-    fine, parts = np.where(deep[:, None], 0.0, coarse), found.parts[divided]
+    divided = np.abs(seen.parts.sides[:, 0]) < 1
+    deep[seen.parts.cell[divided]] = True
+    fine, parts = np.where(deep[:, None], 0.0, coarse), seen.parts[divided]
     for some in parts.pieces():
         X, w = some.rule(points, weights)
         x, normals, _ = cells.at(X, some.cell)
         np.add.at(fine, some.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     hidden = np.linalg.norm(fine - coarse, axis=1)
     if not cells.sum(hidden) > 0:
-        return _Narrow.nothing(len(hidden), found.variation, found.open)
-    return _Narrow(hidden, found.variation, parts, deep, found.open)
+        return _Narrow.nothing(len(hidden), seen.variation, seen.open)
+    return _Narrow(hidden, seen.variation, parts, deep, seen.open)
 
 
 def _moments(
@@ -288,7 +288,7 @@ def _moments(
     def integrals(w: Array, f: Array) -> Array:
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
-    found = np.zeros((len(chosen), space.dim, components))
+    by_cell = np.zeros((len(chosen), space.dim, components))
     sizes, squares, errors, each = np.zeros(len(chosen)), np.zeros(len(chosen)), 0.0, len(CHILDREN[cells.dimension])
     whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
     for depth in range(DEEPEST + 1):
@@ -305,7 +305,7 @@ def _moments(
             at, size = number[smaller.cell[kept]], np.linalg.norm(f[kept], axis=-1)
             if len(at):  # Basix tabulates no empty set of points
                 phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(*size.shape, space.dim)
-                np.add.at(found, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
+                np.add.at(by_cell, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
                 np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
                 np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
@@ -315,7 +315,7 @@ def _moments(
             break
         together = np.concatenate([np.empty((0, components)), *left])
         whole = [together[i : i + AT_ONCE] for i in range(0, len(together), AT_ONCE)]
-    return found, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
+    return by_cell, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
 
 
 def _bounded(at_nodes: Array, mean: Array, between: Array, f: Array) -> Array:

@@ -91,7 +91,7 @@ class PointGradient:
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
-            self._given += [_Given(here, _following(field, values)) for here, field in varying]
+            self._given += [_Given(target, _following(field, values)) for target, field in varying]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
                 self._work.append(_energy(term.density, [placement, self._u, self._v], place, parts, parameters))

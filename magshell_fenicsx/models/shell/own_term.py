@@ -328,16 +328,16 @@ class OwnTerm:
     def _strangers(self) -> list[Expr]:
         """What else is in the density: fields, constants and coordinates of some mesh."""
         W, r0, u, m = self._symbolic
-        known = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
+        arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
             terminal
             for terminal in traverse_unique_terminals(W)
-            if isinstance(terminal, Coefficient | Constant | GeometricQuantity) and terminal not in known
+            if isinstance(terminal, Coefficient | Constant | GeometricQuantity) and terminal not in arguments
         ]
 
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
-        found = extract_coefficients(self._symbolic.W)
-        return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in found)
+        coefficients = extract_coefficients(self._symbolic.W)
+        return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients)
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
         """What its densities take after the jets."""
@@ -349,8 +349,8 @@ class OwnTerm:
     def _same(self, *samples: "Sample") -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
         for density in self.densities:
-            here, there = (self._value(sample, density) for sample in samples)
-            if not abs(here - there) <= SAME * max(abs(here), abs(there)):  # nan: no symmetry is known
+            first, second = (self._value(sample, density) for sample in samples)
+            if not abs(first - second) <= SAME * max(abs(first), abs(second)):  # nan: no symmetry is known
                 return False
         return True
 

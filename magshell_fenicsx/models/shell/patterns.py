@@ -77,10 +77,10 @@ class WithinRims:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         centre = r0.mean(axis=1)
-        found = np.tile(self.outside, (len(r0), 1))
+        vectors = np.tile(self.outside, (len(r0), 1))
         for inside, vector in reversed(self.within):
-            found[inside(centre)] = vector
-        return np.broadcast_to(found[:, None], (*r0.shape[:-1], len(self.outside)))
+            vectors[inside(centre)] = vector
+        return np.broadcast_to(vectors[:, None], (*r0.shape[:-1], len(self.outside)))
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class ByPatch:
     vectors: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        there = self.vectors[: len(r0), None]  # owned cells come first
-        return np.broadcast_to(there, (*r0.shape[:-1], there.shape[-1]))
+        of_cells = self.vectors[: len(r0), None]  # owned cells come first
+        return np.broadcast_to(of_cells, (*r0.shape[:-1], of_cells.shape[-1]))
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ class PatternsByPatch:
     others: ByPatch
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        found = np.array(self.others(r0, n0))
+        vectors = np.array(self.others(r0, n0))
         for inside, pattern in self.patterns:
             of = inside[: len(r0)]  # owned cells come first
             if of.any():
-                found[of] = pattern(r0[of], n0[of])
-        return found
+                vectors[of] = pattern(r0[of], n0[of])
+        return vectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,19 +206,19 @@ def by_patch(
     """
     given = {name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()}
     zero = np.zeros_like(next(iter(given.values())))
-    found = np.tile(given.get("rest", zero), (cells, 1))
+    by_cell = np.tile(given.get("rest", zero), (cells, 1))
     patterns = list[tuple[NDArray[np.bool_], Pattern]]()
     for name, vector in given.items():
         if name in patches:
-            found[patches[name]] = vector
+            by_cell[patches[name]] = vector
             patterns = [(inside & ~patches[name], pattern) for inside, pattern in patterns]
             pattern = vectors[name]
             if callable(pattern):
                 patterns.append((patches[name], pattern))
         elif name != "rest":
-            there = ", ".join(patches) or "none"
-            raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
-    return PatternsByPatch(tuple(patterns), ByPatch(found)) if patterns else ByPatch(found)
+            allowed = ", ".join(patches) or "none"
+            raise MeshError(f"{key}: {name}: the surface has no such patch, only {allowed}")
+    return PatternsByPatch(tuple(patterns), ByPatch(by_cell)) if patterns else ByPatch(by_cell)
 
 
 def pattern_field(

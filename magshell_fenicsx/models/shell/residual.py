@@ -196,8 +196,8 @@ class _Edges:
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
-            here = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
-            points = PointGradient([term], parts, each, len(rows), here, geometry, values, log, V.mesh.comm)
+            at_cells = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
+            points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log, V.mesh.comm)
             self._on[term.name] = rows, points
 
     def compile(self) -> None:
@@ -206,10 +206,10 @@ class _Edges:
 
     def energy(self, nodal: Array, name: str) -> float:
         self._sheet.at_points(nodal, self._there)
-        kernel, found = self._on[name][1].energy(name), 0.0
+        kernel, total = self._on[name][1].energy(name), 0.0
         for _, values in self._evaluated(name, kernel):
-            found += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
-        return found
+            total += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
+        return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         active = [name for name in self.names if factors.get(name)]
@@ -218,8 +218,8 @@ class _Edges:
         self._sheet.at_points(nodal, self._there)
         self._back[:] = 0
         for name in active:
-            for here, values in self._evaluated(name, self._on[name][1].gradient):
-                self._back[here] += factors[name] * values.reshape(-1, self._width)
+            for numbers, values in self._evaluated(name, self._on[name][1].gradient):
+                self._back[numbers] += factors[name] * values.reshape(-1, self._width)
         elements += self._sheet.at_nodes(self._back)
 
     def _evaluated(self, name: str, kernel: PointKernel | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
@@ -228,9 +228,9 @@ class _Edges:
             return
         rows, points = self._on[name]
         for chunk in points.chunks():
-            here = rows[chunk].ravel()
-            np.take(self._there, here, axis=0, out=points.room(chunk).reshape(len(here), -1), mode="clip")
-            yield here, points.evaluate(chunk, kernel)
+            numbers = rows[chunk].ravel()
+            np.take(self._there, numbers, axis=0, out=points.room(chunk).reshape(len(numbers), -1), mode="clip")
+            yield numbers, points.evaluate(chunk, kernel)
 
 
 def _placement(r0: fem.Function, table: Table, frames: Array, parts: Sequence[str]) -> Array:
@@ -294,24 +294,24 @@ def point_parameters(
     serve
         Makes what serves terms each apart.
     """
-    found = {}
+    parameters = {}
     for name, p in constants.items():
         of_terms = slopes(p, terms, f"by {name}", serve)
         for served in {id(slope.points): slope.points for slope in of_terms}.values():
             served.compile()
-        found[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
-    return found
+        parameters[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
+    return parameters
 
 
 def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
     """The derivatives of those terms that a parameter enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
-    found = [Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered]
-    points = serve(found) if found else None
-    for slope in found:
+    derivatives = [Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered]
+    points = serve(derivatives) if derivatives else None
+    for slope in derivatives:
         assert points
         slope.points = points
-    return found
+    return derivatives
 
 
 def derived(density: Density, p: fem.Constant) -> Density:
@@ -319,9 +319,9 @@ def derived(density: Density, p: fem.Constant) -> Density:
 
     def of(*arguments: Any) -> Expr:
         first = len(arguments) - len(density.parameters)
-        here = [first + i for i, q in enumerate(density.parameters) if q is p]
-        variable = ufl.variable(arguments[here[0]])
-        given = [variable if i in here else argument for i, argument in enumerate(arguments)]
+        positions = [first + i for i, q in enumerate(density.parameters) if q is p]
+        variable = ufl.variable(arguments[positions[0]])
+        given = [variable if i in positions else argument for i, argument in enumerate(arguments)]
         return ufl.algorithms.expand_derivatives(ufl.diff(density.of(*given), variable))
 
     return replace(density, of=of, work=None, linear=())

@@ -137,7 +137,7 @@ class Kernel:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
-        self._varying = [(here, on_batches(field, batches, density.sides)) for here, field in varying]
+        self._varying = [(target, on_batches(field, batches, density.sides)) for target, field in varying]
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
@@ -164,8 +164,8 @@ class Kernel:
 
     def evaluate(self, number: int) -> Array:
         """The Hessian's parts at the points of a batch."""
-        for here, values in self._varying:
-            fill(here, values.latest[number])
+        for target, values in self._varying:
+            fill(target, values.latest[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
@@ -203,11 +203,11 @@ def parameters_at(
 
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
-    here = [
+    at_points = [
         points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0]) for p in parameters
     ]
-    pairs = zip(here, parameters, strict=True)
-    return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]
+    pairs = zip(at_points, parameters, strict=True)
+    return at_points, [(target, p) for target, p in pairs if isinstance(p, fem.Function)]
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
@@ -230,8 +230,8 @@ def on_batches(field: fem.Function, batches: Sequence[Batch], sides: int = 1) ->
 
 def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:
     """(points, sides * components) on the edges, or in the cells, of a batch."""
-    found = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
-    return np.hstack(found) if len(found) > 1 else found[0]
+    values = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
+    return np.hstack(values) if len(values) > 1 else values[0]
 
 
 def fill(field: fem.Function, values: Array) -> None:

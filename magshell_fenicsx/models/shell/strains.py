@@ -85,12 +85,12 @@ class TangentFrame:
 
         The stretch s of the thickness is 1, or that of a volume that stays.
         """
-        found = self._carried(self._deformed(u), v, u)
+        carried = self._carried(self._deformed(u), v, u)
         if not thins:
-            return found
+            return carried
         m, area = _area_vector(self.jet[:3] + u[:3])
         thinned = self.area / area - 1
-        return np.asarray(found + (thinned * _dot(self.n0, v) / area)[..., None] * m)
+        return np.asarray(carried + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
         """R v with the rotation R of F, of vectors (..., 3); see `magnetism.laws`."""

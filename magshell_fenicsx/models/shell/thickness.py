@@ -68,8 +68,8 @@ class PlacedFactor:
 
     def in_cells(self, cells: Cells) -> Array:
         """Its values (cells, nodes) in cells in space; collective."""
-        there = replace(cells, nodal=self.place.own(cells.nodal))
-        return self.times * self.own.shown(there, self.own.at(there.nodal))
+        at_place = replace(cells, nodal=self.place.own(cells.nodal))
+        return self.times * self.own.shown(at_place, self.own.at(at_place.nodal))
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
@@ -104,8 +104,8 @@ def thickness_field(
     values = thickness.at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     if thickness.carried:
-        between, there = thickness.carried.between()
-        refuse_unfit(between[..., 0], there, V.mesh.comm)
+        between, sampled = thickness.carried.between()
+        refuse_unfit(between[..., 0], sampled, V.mesh.comm)
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
@@ -157,8 +157,8 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "lo
         If there is no such patch.
     """
     if name not in patches:
-        there = ", ".join(patches) or "none"
-        raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
+        allowed = ", ".join(patches) or "none"
+        raise MeshError(f"{key}: {name}: the surface has no such patch, only {allowed}")
     return patches[name]
 
 

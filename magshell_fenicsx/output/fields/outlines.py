@@ -22,19 +22,19 @@ DIGITS = 7  # of the corners of faces
 
 def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
     """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven sources and bodies."""
-    found = list[Array]()
+    lines_in_space = list[Array]()
     for each, Q, t, _ in _placed(loads, mu, h):
-        found += [line @ Q.T + t for line in getattr(each, "lines", ())]
-    return tuple(found)
+        lines_in_space += [line @ Q.T + t for line in getattr(each, "lines", ())]
+    return tuple(lines_in_space)
 
 
 def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]:
     """Their faces, of those that have any."""
-    found = list[Solid]()
+    solids_in_space = list[Solid]()
     for each, Q, t, name in _placed(loads, mu, h):
         if solid := getattr(each, "solid", None):
-            found.append(replace(solid.moved(Q, t), name=solid.name or name))
-    return tuple(found)
+            solids_in_space.append(replace(solid.moved(Q, t), name=solid.name or name))
+    return tuple(solids_in_space)
 
 
 def _placed(loads: Loads, mu: Mapping[str, float], h: float) -> Iterator[tuple[Any, Array, Array, str]]:
@@ -115,12 +115,12 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     sizes = np.array(parts["sizes"], dtype=int).reshape(-1, 2)
     names = bytes(int(code) for code in parts["names"]).decode().split("\0")
     triangles = np.array(dict(ARRAY.findall(polys))["connectivity"].split(), dtype=int).reshape(-1, 3)
-    poles, found, start, first_one = np.array(parts["pole"], dtype=float), list[Solid](), on_lines, 0
+    poles, solids, start, first_one = np.array(parts["pole"], dtype=float), list[Solid](), on_lines, 0
     for name, (n, m) in zip(names, sizes, strict=False):
         own = poles[start : start + n]
         numbers = triangles[first_one : first_one + m] - start
         if numbers.size and not 0 <= numbers.min() <= numbers.max() < n:
             raise IndexError(name)
-        found.append(Solid(points[start : start + n], numbers, name, own if own.any() else None))
+        solids.append(Solid(points[start : start + n], numbers, name, own if own.any() else None))
         start, first_one = start + n, first_one + m
-    return lines, tuple(found)
+    return lines, tuple(solids)

@@ -99,10 +99,10 @@ class Torque:
     def __call__(self, du: Array) -> Array:
         """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
         turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
-        found = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
+        torque = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
         if self.dual is not None and self.transposed is not None:
-            found = found + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
-        return np.asarray(found)
+            torque = torque + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
+        return np.asarray(torque)
 
 
 def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
@@ -192,8 +192,8 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
     square = 1 + 2 * E
     S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
     stretches = [*np.sqrt(np.moveaxis(square, -1, 0)), 1 / np.sqrt(np.prod(square, axis=-1))]
-    found = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
-    return found | {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
+    stretched = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
+    return stretched | {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
 
 
 def in_space(S: Array, t: Array) -> Array:
@@ -286,21 +286,21 @@ class PointFields:
         gap_over_h
             (...) the least gap to a body.
         """
-        frame, found = self._frame, dict[str, Array]()
+        frame, fields = self._frame, dict[str, Array]()
         if self._carried:
             moves = self._carried.law == "deformation"
-            found["Br"] = frame.convected(self.Br, u, thins=self._thins) if moves else frame.rotated(self.Br, u)
+            fields["Br"] = frame.convected(self.Br, u, thins=self._thins) if moves else frame.rotated(self.Br, u)
         if self._field:
-            found["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
+            fields["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
             m = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
             n = m / np.linalg.norm(m, axis=-1, keepdims=True)
-            found["J"] = self._field.soft.polarisation(inside(frame.jet[0]), self.n0, n, found["Ba"])
+            fields["J"] = self._field.soft.polarisation(inside(frame.jet[0]), self.n0, n, fields["Ba"])
         if self._torque:
-            found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
+            fields["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:
-            found["gap_over_h"] = self._gap(u, mu)
-        return found
+            fields["gap_over_h"] = self._gap(u, mu)
+        return fields
 
     def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
         """The deformed thickness over the undeformed one; see `parts.gap`."""

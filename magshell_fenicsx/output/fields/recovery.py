@@ -210,13 +210,13 @@ class RecoveredShell:
             Name -> (m, q, 6) at the samples, see `six`.
         """
         fit = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
-        found = dict(zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True))
+        at_nodes = dict(zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True))
         jumps = {
-            name: relative_jump(tensors[name], self._table @ found[name][self._numbers], self._weight, zero)
+            name: relative_jump(tensors[name], self._table @ at_nodes[name][self._numbers], self._weight, zero)
             for name, zero in ROUNDING.items()
         }
         t = frames(n0)
-        components = {name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in found.items()}
+        components = {name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in at_nodes.items()}
         smooth = {name: in_space(S, t) for name, S in components.items()}
         return smooth | principal_fields(components), jumps
 

@@ -163,14 +163,14 @@ class SurfaceGatherer:
         if gap is not None:
             gap = np.repeat(gap[: self._owned, None] / self._model.material.h, len(self._places), axis=1)
             values[GAP] = np.minimum(values.get(GAP, np.inf), gap)
-        found = {name: self._averaged(each) for name, each in values.items()}
+        averaged = {name: self._averaged(each) for name, each in values.items()}
         nodes = self._averaged(jet[0])
         stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)
         tensors = {name: self._gathered(np.einsum("...ia,...a->...i", self._six, S)) for name, S in stresses.items()}
         if not self._recovered:
             return None
         smooth, jumps = self._recovered.fields(tensors, self._n0)
-        fields = self._constant | smooth | rubber_fields(smooth, self._model.material.law) | found
+        fields = self._constant | smooth | rubber_fields(smooth, self._model.material.law) | averaged
         return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"])
 
     def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -261,23 +261,23 @@ def completed(surface: Surface, mirror: Array) -> Surface:
 
 def whole(surface: Surface, mirror: Mirror) -> Surface:
     """All of the shell from the half, or the sector, that is modelled."""
-    found = completed(surface, mirror.plane)
+    joined = completed(surface, mirror.plane)
     if not isinstance(mirror, Sector):
-        return found
+        return joined
     turns = [image.Q.T for image in mirror.images if image.sign > 0]
-    copies = [_moved(found, Q) for Q in turns]
-    count = len(found.r0)
+    copies = [_moved(joined, Q) for Q in turns]
+    count = len(joined.r0)
 
     def every(of: Callable[[Surface], Array]) -> Array:
         return np.concatenate([of(copy) for copy in copies])
 
     return replace(
-        found,
+        joined,
         r0=every(lambda s: s.r0),
         u=every(lambda s: s.u),
         n0=every(lambda s: s.n0),
-        cells=np.concatenate([found.cells + k * count for k in range(len(copies))]),
-        fields={name: every(lambda s, name=name: s.fields[name]) for name in found.fields},  # type: ignore[misc]
+        cells=np.concatenate([joined.cells + k * count for k in range(len(copies))]),
+        fields={name: every(lambda s, name=name: s.fields[name]) for name in joined.fields},  # type: ignore[misc]
     )
 
 
@@ -310,11 +310,11 @@ def _parity(surface: Surface, normal: Array, offset: float) -> float:
     """
     on = np.abs(surface.r0 @ normal - offset) < ON_PLANE
     for name in ("Ba", "Br"):
-        there = surface.fields.get(name, np.zeros((len(on), 3)))[on]
-        size = np.nan_to_num(np.linalg.norm(there, axis=1))
+        vectors = surface.fields.get(name, np.zeros((len(on), 3)))[on]
+        size = np.nan_to_num(np.linalg.norm(vectors, axis=1))
         if size.max(initial=0.0) > 0:
             jumps = size.min() < size.max() / 2
-            return 1.0 if jumps or 2 * np.nansum((there @ normal) ** 2) <= np.sum(size**2) else -1.0
+            return 1.0 if jumps or 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(size**2) else -1.0
     return 1.0
 
 

@@ -121,14 +121,14 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     vtkObject.GlobalWarningDisplayOff()  # the message follows
     try:
         reader.Update()
-        found = _surface(reader.GetOutput(), file)
+        surface_and_about = _surface(reader.GetOutput(), file)
     except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
         raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     finally:
         vtkObject.SetGlobalWarningDisplay(shown)
     if errors or reader.GetErrorCode():
         raise Damaged(f"{file}: is damaged: VTK cannot read it")
-    return found
+    return surface_and_about
 
 
 def is_whole(file: Path) -> bool:
@@ -146,8 +146,8 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     def arrays(of: Any) -> dict[str, Array]:
-        there = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
-        return {name: vtk_to_numpy(array) for name, array in there if array}  # texts are no numbers
+        named = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
+        return {name: vtk_to_numpy(array) for name, array in named if array}  # texts are no numbers
 
     cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(grid.GetNumberOfCells(), -1)
     data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
@@ -255,11 +255,11 @@ def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     numbers = [float(row["point"]) for row in rows]
     varied = {str(row.get("amplitude", "")) for row in rows} - {""}
     if rows and "time" in rows[0]:
-        found = list[float]()
+        times = list[float]()
         for row in rows:
             t = float(row[shown("time", row).name])
-            found.append(max(t, found[-1] + LATER) if found else t)
-        return found
+            times.append(max(t, times[-1] + LATER) if times else t)
+        return times
     if len(varied) != 1:
         return numbers
     column = shown(amplitude(next(iter(varied))).column, rows[0]).name

@@ -111,8 +111,8 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    found = [c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []]
-    palette.putpalette([*WHITE, *found[3:]])
+    levels = [c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []]
+    palette.putpalette([*WHITE, *levels[3:]])
     return palette
 
 

@@ -62,24 +62,24 @@ class Beside:
     def _visible(self) -> list[NDArray[np.bool_]]:
         """Where each is in front of the others and of the shell."""
         depths = [seen.depth for seen in self._seen]
-        found = []
+        in_front = []
         for i, depth in enumerate(depths):
             others = [self._shell.depth, *(other for k, other in enumerate(depths) if k != i)]
-            found.append((depth > -np.inf) & np.logical_and.reduce([depth >= other for other in others]))
-        return found
+            in_front.append((depth > -np.inf) & np.logical_and.reduce([depth >= other for other in others]))
+        return in_front
 
     @cached_property
     def laid(self) -> list[Laid]:
         """All of them, to be put on an image of the shell."""
-        behind, found = self._shell.depth > -np.inf, []
+        behind, laid = self._shell.depth > -np.inf, []
         for solid, seen, visible in zip(self._solids, self._seen, self._visible, strict=True):
             alone, over = BODIES if solid.poles is None else MAGNETS
             part = alone * in_pixels(visible & ~behind) + over * in_pixels(visible & behind)
             table = np.array([BODY] if solid.poles is None else [SOUTH, NORTH])
             values = np.zeros(len(solid.points)) if solid.poles is None else solid.poles
             most = float(np.abs(values).max()) or 1.0
-            found.append(Laid(seen.painted(values[solid.triangles.ravel()], (-most, most), table), part))
-        return found
+            laid.append(Laid(seen.painted(values[solid.triangles.ravel()], (-most, most), table), part))
+        return laid
 
     @property
     def lines(self) -> list[Array]:
@@ -87,12 +87,12 @@ class Beside:
         import contourpy
 
         left, _, _, high = self._window.box
-        found = list[Array]()
+        pieces = list[Array]()
         for solid, seen, visible in zip(self._solids, self._seen, self._visible, strict=True):
             made: Any = contourpy.contour_generator(z=np.pad(in_pixels(visible), 1, mode="edge")).lines(0.5)
-            found += [np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale for line in made]
-            found += self._edges(solid, seen)
-        return found
+            pieces += [np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale for line in made]
+            pieces += self._edges(solid, seen)
+        return pieces
 
     def _edges(self, solid: Solid, seen: InView) -> list[Array]:
         if not (creases := solid.creases):
@@ -107,15 +107,15 @@ class Beside:
     @property
     def poles(self) -> list[tuple[float, float, str]]:
         """Where N and S of magnets stand, as far as they are seen."""
-        found = []
+        letters = []
         for solid, seen in zip(self._solids, self._seen, strict=True):
             for sign, letter in ((1, "N"), (-1, "S")) if solid.poles is not None else ():
                 centres = _centres(solid)
                 own = centres[(_poles(solid) * sign > 0) & seen.shows(centres, 2 * WITHIN / self._window.scale)]
                 if len(own) and self._shell.shows(own.mean(axis=0)[None], 0.0)[0]:
                     x, y = self._camera(own.mean(axis=0))[:2]
-                    found.append((float(x), float(y), letter))
-        return found
+                    letters.append((float(x), float(y), letter))
+        return letters
 
 
 def _pieces(solid: Solid) -> Tessellation:

@@ -114,13 +114,13 @@ def bent_alone(surface: Surface, h: float) -> str:
 
 def stretches(surface: Surface) -> list[Coloured]:
     """Stretches and true stresses of rubber; stresses are white at zero."""
-    found = []
+    coloured = []
     for name, said in STRETCHES.items():
         if (values := surface.fields.get(name)) is not None:
             low, high, signed = float(values.min()), float(values.max()), name.startswith("sigma")
             limits = from_zero(low, max(high, ROUNDING["E_1"])) if signed else (low, max(high, low + 1e-9))
-            found.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
-    return found
+            coloured.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
+    return coloured
 
 
 def jump_said(jump: float | None, what: str) -> str:

@@ -215,7 +215,7 @@ def _once(axes: "Axes", name: str) -> str:
 NAMED = 12  # most waves in the legend
 
 
-def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], style: OutputSection) -> "Figure":
+def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection) -> "Figure":
     """Frequencies over the amplitude that varied last; the n-th lowest of each wave is one line.
 
     In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
@@ -225,11 +225,11 @@ def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], style: O
     varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
     column = shown(registered(varied).column, rows[0]) if varied else None
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
-    known = (it for it in found if it.omega2 > 0 and not np.isnan(it.hertz))
-    of_root = max((it.hertz / np.sqrt(it.omega2) for it in known), default=0.0)  # Hz; 0 without a density
+    vibrating = (it for it in frequencies if it.omega2 > 0 and not np.isnan(it.hertz))
+    of_root = max((it.hertz / np.sqrt(it.omega2) for it in vibrating), default=0.0)  # Hz; 0 without a density
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
-    for it in (it for it in found if it.point in places):
+    for it in (it for it in frequencies if it.point in places):
         signed = np.sign(it.omega2) * of_root * np.sqrt(abs(it.omega2)) if of_root else it.omega2
         lines[it.wave, count[it.point, it.wave]].append((places[it.point], float(signed)))
         count[it.point, it.wave] += 1
@@ -240,7 +240,7 @@ def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], style: O
         named = wave if number == 0 and waves.index(wave) < NAMED else None
         axes.plot(*zip(*points, strict=True), ".-", color=f"C{waves.index(wave) % 10}", label=named, lw=1, ms=4)
     axes.axhline(0, color="0.6", lw=0.6)
-    grows = "; below zero it grows" if any(it.omega2 < 0 for it in found) else ""
+    grows = "; below zero it grows" if any(it.omega2 < 0 for it in frequencies) else ""
     said = f"frequency  (Hz){grows}"
     axes.set(xlabel=column.label if column else "", ylabel=said if of_root else r"$\omega^2 \rho R^2/E$")
     if waves != [""]:

@@ -69,10 +69,10 @@ def place(row: Row, amplitude: str) -> tuple[float, float]:
     return x.on_axis(row), y.on_axis(row)
 
 
-def named(known: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
+def named(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
     """A quantity whose words name the point of `w_pole_over_h`; `dollar` stands for that sign in the name."""
     name = pole_name(row, pole).replace("$", dollar)
-    return replace(known, words=known.words.replace(POLE, name), note=known.note.replace(POLE, name))
+    return replace(of_point, words=of_point.words.replace(POLE, name), note=of_point.note.replace(POLE, name))
 
 
 def is_unstable(row: Row) -> bool:
@@ -96,20 +96,20 @@ class Line:
     @property
     def unstable(self) -> list[bool]:
         """Whether each of the segments between the rows is: as its end, or if that is located as its beginning."""
-        found: list[bool] = []
+        of_segments: list[bool] = []
         for first, last in pairwise(self.rows):
             rows = [row for row in (last, first) if row["label"] not in LOCATED]
-            found.append(is_unstable(rows[0]) if rows else not (found and found[-1]))
-        return found
+            of_segments.append(is_unstable(rows[0]) if rows else not (of_segments and of_segments[-1]))
+        return of_segments
 
     @property
     def pieces(self) -> list[tuple[int, int, bool]]:
         """The first and the last row of each part that is stable or unstable, and whether it is unstable."""
-        found = []
+        parts = []
         for unstable, group in groupby(enumerate(self.unstable), key=lambda each: each[1]):
             numbers = [i for i, _ in group]
-            found.append((numbers[0], numbers[-1] + 1, unstable))
-        return found
+            parts.append((numbers[0], numbers[-1] + 1, unstable))
+        return parts
 
     def joined(self, x: Sequence[float], y: Sequence[float]) -> Array:
         """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows."""
@@ -153,8 +153,8 @@ def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ())
         return xy
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
     chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, 1e-12)))])
-    there = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
-    slopes = np.array([_slopes(chord, values, there) for values in xy])
+    ends = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
+    slopes = np.array([_slopes(chord, values, ends) for values in xy])
     return np.asarray(scipy.interpolate.CubicHermiteSpline(chord, xy, slopes, axis=1)(_fine(chord)))
 
 
@@ -191,10 +191,10 @@ def splined(x: Sequence[float], y: Sequence[float], t: Sequence[float]) -> Array
     if later.sum() < 4 or not later[2:].all():
         return smooth(x, y)
     fine = _fine(times)
-    found = np.asarray(scipy.interpolate.CubicSpline(times[later], xy[:, later], axis=1)(fine))
+    curve = np.asarray(scipy.interpolate.CubicSpline(times[later], xy[:, later], axis=1)(fine))
     if not later[1]:
-        found[:, : FINE + 1] = np.linspace(xy[:, 0], xy[:, 1], FINE + 1).T
-    return found
+        curve[:, : FINE + 1] = np.linspace(xy[:, 0], xy[:, 1], FINE + 1).T
+    return curve
 
 
 def _fine(at: Array) -> Array:

@@ -100,13 +100,13 @@ def small_panels(
 
 def searched(rows: Sequence[Row]) -> list[Row]:
     """The rows of all solutions, and before those of a step the last point of its path."""
-    found: list[Row] = []
+    rows_of_solutions: list[Row] = []
     for i, row in enumerate(rows):
         if row["label"] == SOLUTION:
             first = rows[i - 1]["label"] != SOLUTION or rows[i - 1]["step"] != row["step"]
             before = [rows[max(j for j in range(i) if rows[j]["branch"] == 0)]] if first else []
-            found += [*before, row]
-    return found
+            rows_of_solutions += [*before, row]
+    return rows_of_solutions
 
 
 def solutions_figure(
@@ -193,7 +193,7 @@ def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera:
 
 def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
     """Point of an instability -> the rows of the same one where the path comes back to it, itself the first."""
-    found: dict[int, list[Row]] = {}
+    met: dict[int, list[Row]] = {}
     moved = [name for name in (singular[0] if singular else ()) if quantity(name).kind in ("displacement", "place")]
     sizes = {name: max(abs(float(row[name])) for row in singular) for name in moved}
 
@@ -202,12 +202,12 @@ def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
         return near and all(one[name] == other[name] for name in ("label", "mode", "amplitude"))
 
     for row in singular:
-        same = next((each for each in found.values() if alike(each[0], row)), None)
+        same = next((each for each in met.values() if alike(each[0], row)), None)
         if same is None:
-            found[int(row["point"])] = [row]
+            met[int(row["point"])] = [row]
         else:
             same.append(row)
-    return found
+    return met
 
 
 def _null_vector(
@@ -228,9 +228,9 @@ def _null_vector(
     if row["amplitude"]:
         column = amplitude(str(row["amplitude"])).column
         largest = max(abs(float(each[column])) for each in rows)
-        there = row if abs(float(row[column])) > ZERO * largest else {**row, column: 0.0}
-        there = there if there is row else {**there, shown(column, row).name: 0.0}
-        where = f"\n{named_value(column, there, 5)}"
+        rounded = row if abs(float(row[column])) > ZERO * largest else {**row, column: 0.0}
+        rounded = rounded if rounded is row else {**rounded, shown(column, row).name: 0.0}
+        where = f"\n{named_value(column, rounded, 5)}"
     which = ", ".join(str(numbers[int(each["point"])]) for each in met[int(row["point"])])
     return surface, f"{which}: {row['label']}{kind}{where}"
 

@@ -45,8 +45,8 @@ class Content:
 
 
 def _with_arrows(surface: Surface, h: float) -> Content:
-    found = drawn_arrows(surface)
-    return Content([Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if found else [], far_said(surface))
+    arrows = drawn_arrows(surface)
+    return Content([Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if arrows else [], far_said(surface))
 
 
 def _of_contact(surface: Surface) -> Content:
@@ -110,14 +110,14 @@ class Background:
 
     def _visible(self, lines: Sequence[Array]) -> tuple[tuple[Array, Pen], ...]:
         """Lines (n, 3) in the projection, without the parts that the shell hides."""
-        found = []
+        visible = []
         for line in lines:
             at = np.arange(8 * (len(line) - 1) + 1) / 8  # all corners among them
             fine = np.column_stack([np.interp(at, np.arange(len(line)), x) for x in line.T])
             places = self._camera(fine)[:, :2]
             places[~self.seen.shows(fine, 2 / self.window.scale)] = np.nan
-            found.append((places, OTHERS))
-        return tuple(found)
+            visible.append((places, OTHERS))
+        return tuple(visible)
 
     def panel(self, layer: Coloured, style: OutputSection) -> Panel:
         """The shell in a layer's colours; grey with arrows if it has none."""
@@ -155,12 +155,12 @@ def apart(lines: Sequence[Array], others: Sequence[Array], distance: float) -> l
     if not len(others):
         return list(lines)
     near = cKDTree(np.concatenate(others))
-    found = []
+    broken = []
     for line in lines:
         far = near.query(line)[0] > distance
         if far.any():
-            found.append(np.where(far[:, None], line, np.nan))
-    return found
+            broken.append(np.where(far[:, None], line, np.nan))
+    return broken
 
 
 def silhouette(seen: InView) -> list[Array]:
@@ -193,20 +193,20 @@ def drawn_arrows(
     lengths = {
         name: np.nan_to_num(np.linalg.norm(surface.fields[name], axis=1)) for name in FIELDS.keys() & surface.fields
     }
-    there = [name for name in FIELDS if name in lengths and lengths[name].max() > 0]
+    names = [name for name in FIELDS if name in lengths and lengths[name].max() > 0]
     if camera is None or visible is None:
-        return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in there)
+        return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in names)
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
     seen = np.flatnonzero(visible(r))
     seeds = seen[spread(r[seen], APART * extent)]
-    places, found = camera(r[seeds]), []
-    drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in there}
-    across = _across(list(drawn.values()) or [places]) * BESIDE * extent * (len(there) > 1)
-    for name, side in zip(there, (1, -1, 0), strict=False):
+    places, arrows = camera(r[seeds]), []
+    drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in names}
+    across = _across(list(drawn.values()) or [places]) * BESIDE * extent * (len(names) > 1)
+    for name, side in zip(names, (1, -1, 0), strict=False):
         shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
-        found.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
-    return tuple(found)
+        arrows.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
+    return tuple(arrows)
 
 
 def _across(fields: Sequence[Array]) -> Array:

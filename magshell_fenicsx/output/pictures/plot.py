@@ -199,9 +199,9 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
     if files := gradient_files(run.folder):
         by_result = {of: read_vtu(file)[0] for of, file in files.items()}
         yield from written(gradients_figure(by_result, style, run.camera), style, "gradients")
-    if found := searched(run.rows)[:MOST_PANELS]:
-        surfaces = [run.at(each)[0] for each in found]
-        yield from written(solutions_figure(surfaces, found, about.h, style, run.camera), style, "solutions")
+    if solutions := searched(run.rows)[:MOST_PANELS]:
+        surfaces = [run.at(each)[0] for each in solutions]
+        yield from written(solutions_figure(surfaces, solutions, about.h, style, run.camera), style, "solutions")
 
 
 def in_its_field(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:

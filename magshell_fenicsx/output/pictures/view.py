@@ -59,11 +59,11 @@ class Tessellation:
     def normals(self, r: Array) -> Array:
         """Unit normals (m q, 3) of the surface with nodes at r (n, 3), one sign for each piece."""
         along = np.matmul(self.slopes[:, None], r[self.nodes])
-        found = np.cross(*along).reshape(-1, 3)
+        vectors = np.cross(*along).reshape(-1, 3)
         if self.flat:
             where, n = self.nodes.ravel(), len(r)
-            found = np.column_stack([np.bincount(where, found[:, i], n) for i in range(3)])[where]
-        return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None])
+            vectors = np.column_stack([np.bincount(where, vectors[:, i], n) for i in range(3)])[where]
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None])
 
 
 def tessellated(surface: Surface, most: int = 40_000) -> Tessellation:
@@ -124,10 +124,10 @@ def _outer_faces(cells: Numbers) -> Numbers:
             on = np.flatnonzero(np.isclose(body.points[:, axis], side))
             at = {tuple(np.round(2 * body.points[i, others]).astype(int)): i for i in on}
             faces.append(ours[:, [at[tuple(np.round(2 * p).astype(int))] for p in square.points]])
-    found = np.concatenate(faces)
-    corners = np.sort(found[:, :4], axis=1)
+    all_faces = np.concatenate(faces)
+    corners = np.sort(all_faces[:, :4], axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
-    return np.asarray(found[np.sort(first[count == 1])])
+    return np.asarray(all_faces[np.sort(first[count == 1])])
 
 
 Image = NDArray[np.uint8]
@@ -268,11 +268,11 @@ class InView:
         return np.asarray(at[:, 2] > front - within)
 
 
-def in_pixels(there: NDArray[np.bool_]) -> Array:
+def in_pixels(drawn: NDArray[np.bool_]) -> Array:
     """How much of each pixel of the picture a part of the drawn pixels covers."""
-    covered = there.view(np.uint8)
-    found = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
-    return np.asarray(found / FINER**2)
+    covered = drawn.view(np.uint8)
+    count = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
+    return np.asarray(count / FINER**2)
 
 
 @cache

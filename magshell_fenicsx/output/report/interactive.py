@@ -73,9 +73,9 @@ def _joined(r: Array, triangles: NDArray[np.int32], size: float) -> tuple[NDArra
     cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
     key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2] if size > 1e-5 else _exact(cubes)
     _, kept, number = np.unique(key, return_index=True, return_inverse=True)
-    found = number[triangles]
-    whole = (found[:, 0] != found[:, 1]) & (found[:, 1] != found[:, 2]) & (found[:, 2] != found[:, 0])
-    return kept, found[whole]
+    corners = number[triangles]
+    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    return kept, corners[whole]
 
 
 def _exact(cubes: NDArray[np.int64]) -> NDArray[np.void]:
@@ -244,24 +244,24 @@ def _parts(rows: Sequence[Row], varied: str) -> list[Part]:
     return [part for part in (*others, *drawn) if len(part.rows) > 1]
 
 
-def label(known: Quantity, row: Row, pole: str) -> str:
+def label(of_axis: Quantity, row: Row, pole: str) -> str:
     """The label of an axis, as in curve.png, in HTML."""
-    there = named(known, row, pole)
-    words = f"{there.words} {there.note}".strip()
-    unit = f" ({there.shown_unit})" if there.shown_unit else ""
-    minus = "−" if there.sign < 0 else ""
-    return str(Markup("{}{}{}").format(words, Markup(f" {minus}{there.html}") if there.symbol else "", unit))
+    at_point = named(of_axis, row, pole)
+    words = f"{at_point.words} {at_point.note}".strip()
+    unit = f" ({at_point.shown_unit})" if at_point.shown_unit else ""
+    minus = "−" if at_point.sign < 0 else ""
+    return str(Markup("{}{}{}").format(words, Markup(f" {minus}{at_point.html}") if at_point.symbol else "", unit))
 
 
 def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed") -> list[dict[str, Any]]:
     """Every scalar and every length of a vector, with the colours of the pictures and the limits of the whole path."""
-    found = []
+    fields = []
     for name, caption in SCALARS.items():
         values = [_values(shell, name, h) for shell in shells]
-        there = [v for v in values if v is not None]
-        if len(there) < len(shells):
+        present = [v for v in values if v is not None]
+        if len(present) < len(shells):
             continue
-        low, high = min(float(v.min()) for v in there), max(float(v.max()) for v in there)
+        low, high = min(float(v.min()) for v in present), max(float(v.max()) for v in present)
         if high - low < 1e-12:
             low, high = low - 1.0, low + 1.0
         colours: list[tuple[float, str]] = []  # plotly's own map
@@ -270,12 +270,12 @@ def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed
         elif name in WITH_SIGN:
             low, high = from_zero(low, high)
             colours = _stops(SIGNED, (low, high))
-        parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in there]
+        parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in present]
         steps = [np.rint(255 * part).astype(np.uint8) for part in parts]
         still = all((step == steps[0]).all() for step in steps)
         places = [packed.raw(step) for step in (steps[:1] if still else steps)]
-        found.append({"name": name, "label": caption, "low": low, "high": high, "colours": colours, "at": places})
-    return found
+        fields.append({"name": name, "label": caption, "low": low, "high": high, "colours": colours, "at": places})
+    return fields
 
 
 def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[float, str]]:
@@ -334,8 +334,8 @@ def packed(content: bytes) -> str:
 @cache
 def plotly() -> str | None:
     """Plotly's script, packed; None if it is not installed. Its Python is not imported."""
-    found = importlib.util.find_spec("plotly")
-    for place in (found.submodule_search_locations or []) if found else []:
+    package = importlib.util.find_spec("plotly")
+    for place in (package.submodule_search_locations or []) if package else []:
         file = Path(place) / "package_data" / "plotly.min.js"
         if file.exists():
             return _kept(file)
@@ -346,8 +346,8 @@ def _kept(file: Path) -> str:
     """A file, packed once for all runs."""
     about = file.stat()
     name = f"packed_{file.name}_{about.st_size}_{about.st_mtime_ns}_{LEVEL}"
-    if known := recall(name):
-        return known.decode()
-    found = packed(file.read_bytes())
-    keep(name, found.encode())
-    return found
+    if kept := recall(name):
+        return kept.decode()
+    packed_file = packed(file.read_bytes())
+    keep(name, packed_file.encode())
+    return packed_file

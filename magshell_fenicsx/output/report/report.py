@@ -144,9 +144,9 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
 
 def _head(name: str, line: Line) -> Markup:
     """The heading of a column with its unit, and its size where the symbol does not have it."""
-    known = shown(name, line)
-    where = pole_head(line) if name == "w_pole_over_h" else head(known)
-    return Markup("{} ({})").format(where, known.shown_unit) if known.shown_unit else where
+    of_column = shown(name, line)
+    where = pole_head(line) if name == "w_pole_over_h" else head(of_column)
+    return Markup("{} ({})").format(where, of_column.shown_unit) if of_column.shown_unit else where
 
 
 def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:

@@ -113,9 +113,9 @@ def symbol(name: str) -> Markup:
     return head(quantity(name))
 
 
-def head(known: Quantity) -> Markup:
+def head(of_column: Quantity) -> Markup:
     """The heading of a quantity."""
-    return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
+    return Markup(of_column.html) if of_column.symbol else Markup("{}").format(of_column.words)
 
 
 def pole_head(line: Line, pole: str = POLE) -> Markup:
@@ -135,22 +135,22 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     pole
         Name of the point of w_pole_over_h.
     """
-    there = lines[0] if lines else {}
-    in_units = {known.name for name in there if (known := shown(name, there)).name != name}
-    names = [name for name in there if name != "point" and name not in in_units]
+    first_line = lines[0] if lines else {}
+    in_units = {of_column.name for name in first_line if (of_column := shown(name, first_line)).name != name}
+    names = [name for name in first_line if name != "point" and name not in in_units]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
-    found: dict[str, list[str]] = {}
+    varying: dict[str, list[str]] = {}
     for name in order:
         values = [line.get(name, "") for line in lines]
-        again = name.startswith("w_") and any(_same(values, other) for key, other in found.items() if key[:2] == "w_")
+        again = name.startswith("w_") and any(_same(values, other) for key, other in varying.items() if key[:2] == "w_")
         if name in ("point", "label") or (len(set(values)) > 1 and not again):
-            found[name] = values
-    energies = _energies(lines, [name for name in found if quantity(name).kind == "energy"])
+            varying[name] = values
+    energies = _energies(lines, [name for name in varying if quantity(name).kind == "energy"])
     table = {}
-    for name in found:
-        known = shown(name, there)
-        of_all = energies if known.kind == "energy" else ()
-        table[name] = _column(known, [line.get(known.name, "") for line in lines], length_unit, of_all)
+    for name in varying:
+        of_column = shown(name, first_line)
+        of_all = energies if of_column.kind == "energy" else ()
+        table[name] = _column(of_column, [line.get(of_column.name, "") for line in lines], length_unit, of_all)
     if at_pole := table.get("w_pole_over_h"):
         table["w_pole_over_h"] = replace(at_pole, head=pole_head(lines[0], pole))
     return list(table.values())
@@ -161,18 +161,20 @@ def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
     return [float(line[shown(name, line).name]) for line in lines for name in names]
 
 
-def _column(known: Quantity, values: Sequence[str], length_unit: str, beside: Sequence[float] = ()) -> Column:
+def _column(of_column: Quantity, values: Sequence[str], length_unit: str, beside: Sequence[float] = ()) -> Column:
     """A column; `beside` are the numbers of others with the same power of ten."""
-    if known.kind == "text":
-        varied = [quantity(amplitude(value).column).words for value in values] if known.name == "amplitude" else values
-        return Column(head(known), Markup(), varied, numeric=False)
-    if known.kind == "count":
-        return Column(head(known), Markup(), values)
+    if of_column.kind == "text":
+        varied = (
+            [quantity(amplitude(value).column).words for value in values] if of_column.name == "amplitude" else values
+        )
+        return Column(head(of_column), Markup(), varied, numeric=False)
+    if of_column.kind == "count":
+        return Column(head(of_column), Markup(), values)
     exponent, cells = column([float(value) for value in values], beside)
     size = power(exponent) if exponent else Markup()
-    title = Markup("{} {}").format(head(known), known.note) if known.note else head(known)
+    title = Markup("{} {}").format(head(of_column), of_column.note) if of_column.note else head(of_column)
     in_case = {"place": "m", "reaction": "N", "moment": "N m"}  # of a path.csv without columns in units
-    unit = known.shown_unit or (in_case.get(known.kind, "") if length_unit else "")
+    unit = of_column.shown_unit or (in_case.get(of_column.kind, "") if length_unit else "")
     return Column(title, Markup("{} {}").format(size, unit), cells)
 
 
@@ -196,11 +198,11 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         points = summary.get("limit_points") or [{}]
         point = points[min(located(lines).index(first), len(points) - 1)]
         sentences.append(_instability(first, summary, lines, point.get("mode_at")))
-    if found := summary.get("solutions"):
-        stable = sum(it["stable"] for it in found)
-        more = "further solution" + "s" * (len(found) != 1)
+    if solutions := summary.get("solutions"):
+        stable = sum(it["stable"] for it in solutions)
+        more = "further solution" + "s" * (len(solutions) != 1)
         sentences.append(
-            Markup("A search has found {} {}, {} of them stable.").format(len(found), more, stable or "none")
+            Markup("A search has found {} {}, {} of them stable.").format(len(solutions), more, stable or "none")
         )
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
@@ -215,25 +217,25 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 def _snaps(summary: Summary) -> list[Markup]:
     """How long the first snap takes until half way, and how far beyond its end it goes."""
-    if not (found := summary.get("snaps")):
+    if not (snaps := summary.get("snaps")):
         return []
     time = summary.get("snap_time_ms")
     took = (
-        Markup("{} ms").format(number(time, 4)) if time else Markup("the time {}").format(number(found[0]["time"], 4))
+        Markup("{} ms").format(number(time, 4)) if time else Markup("the time {}").format(number(snaps[0]["time"], 4))
     )
-    beyond = 100 * float(found[0]["overshoot"])
+    beyond = 100 * float(snaps[0]["overshoot"])
     more = Markup(", and overshoots by {} % of its way").format(number(beyond, 2)) if beyond > LEAST_BEYOND else ""
     return [Markup("The snap takes {} until half way{}.").format(took, more)]
 
 
 def _error(summary: Summary) -> list[Markup]:
     """The estimated error of a run with a tolerance, and the best estimate of its rounds if that is another."""
-    known = summary.get("tolerance") or {}
-    if (estimate := known.get("error_estimate")) is None:
+    tolerance = summary.get("tolerance") or {}
+    if (estimate := tolerance.get("error_estimate")) is None:
         return []
     said, best = (
         Markup("The estimated relative error of the result is {}").format(number(estimate, 2)),
-        known.get("best"),
+        tolerance.get("best"),
     )
     if best and best["error_estimate"] < estimate:
         least = number(best["error_estimate"], 2)
@@ -251,8 +253,8 @@ def value(line: Line, summary: Summary) -> Markup:
     """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)"."""
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
-    known = shown(name, line)
-    measured = Markup(" ({} {})").format(number(float(line[known.name])), known.si) if known.name != name else ""
+    size = shown(name, line)
+    measured = Markup(" ({} {})").format(number(float(line[size.name])), size.si) if size.name != name else ""
     return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
 
 
@@ -307,16 +309,16 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
     """Where a mode is largest, in words; as a direction on a sphere, as imperfections give their places."""
     if place is None:
         return Markup("")
-    known = summary["dimensions"]
-    in_metres = bool(known["radius"]) and known["units"] == "SI"
+    dimensions = summary["dimensions"]
+    in_metres = bool(dimensions["radius"]) and dimensions["units"] == "SI"
     key, numbers = next(iter(place_in_units(place, shell_of(summary["case"])["geometry"], in_metres=in_metres).items()))
     if key == "degrees" and numbers[0] < NEAR_POLE:
         return Markup("; its mode is largest near the pole")
     if key == "degrees":
-        found = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
+        angles = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
     else:
-        found = f"({', '.join(f'{x:.3g}' for x in numbers)}){f' {key}' if key else ''}"
-    return Markup("; its mode is largest at {}").format(found)
+        angles = f"({', '.join(f'{x:.3g}' for x in numbers)}){f' {key}' if key else ''}"
+    return Markup("; its mode is largest at {}").format(angles)
 
 
 def place_in_units(place: Sequence[float], geometry: str, *, in_metres: bool) -> dict[str, list[float]]:
@@ -343,8 +345,8 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     arrived = last["label"] in ("target", "field") and not summary["stopped"]
     reached = "The run reached its target" if arrived else "The last point"
     place = pole_name(last, pole_of(summary["case"]))
-    found = Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place, lines))
-    return found + _untouched(last)
+    sentence = Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place, lines))
+    return sentence + _untouched(last)
 
 
 def _untouched(line: Line) -> Markup:
@@ -355,10 +357,10 @@ def _untouched(line: Line) -> Markup:
     gap = -float(line[name])
     if above_rounding(gap, ()) <= 0:
         return Markup("")
-    known = shown(name, line)
-    unit = f" {known.shown_unit}" if known.shown_unit else " h"
+    of_gap = shown(name, line)
+    unit = f" {of_gap.shown_unit}" if of_gap.shown_unit else " h"
     return Markup(" The body has not touched the shell: there is a gap of {}{}.").format(
-        number(-float(line[known.name])), unit
+        number(-float(line[of_gap.name])), unit
     )
 
 
@@ -379,6 +381,6 @@ def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
     return number(above_rounding(float(line[name]), (float(each[name]) for each in lines)))
 
 
-def _amount(known: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
-    told = amount(known.name, line, lines)
-    return Markup("{} = {}{}").format(head(known), told, f" {known.shown_unit}" if known.shown_unit else "")
+def _amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
+    told = amount(of_column.name, line, lines)
+    return Markup("{} = {}{}").format(head(of_column), told, f" {of_column.shown_unit}" if of_column.shown_unit else "")

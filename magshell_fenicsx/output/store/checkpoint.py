@@ -85,27 +85,27 @@ class Ordering:
         Number of values on this rank, and whether it is the last rank of the space.
     """
 
-    def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, known: Array | None = None) -> None:
+    def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, places: Array | None = None) -> None:
         self._within, self._comm = V.mesh.comm, comm
         self._values = V.dofmap.index_map_bs
         mine = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
         present = self._within.allgather(mine)
-        known = comm.bcast(known)
-        if known is None:
+        places = comm.bcast(places)
+        if places is None:
             self.places: Array = np.concatenate(present)
             first = sum(len(part) for part in present[: self._within.rank])
             self._mine: NDArray[np.int64] = first + np.arange(len(mine))
         else:
-            self.places, self._mine = known, self._found(known, mine, comm)
+            self.places, self._mine = places, self._found(places, mine, comm)
         self._parts = self._within.allgather(self._mine)
         self.size, self.last = len(self._mine) * self._values, self._within.rank == self._within.size - 1
 
-    def _found(self, known: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
+    def _found(self, places: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
         """The numbers of this rank's nodes among the known ones."""
-        distance, number = scipy.spatial.cKDTree(known).query(mine)
+        distance, number = scipy.spatial.cKDTree(places).query(mine)
         parts = self._within.allgather(number)
-        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(known)))
-        close = np.all(distance < CLOSE * np.abs(known).max())
+        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(places)))
+        close = np.all(distance < CLOSE * np.abs(places).max())
         if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
             raise CaseError(
                 "--resume: the mesh differs from the checkpoint's; give another folder, or --overwrite in place of "
@@ -163,12 +163,12 @@ def begun_with(file: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     try:
-        known = json.loads(head or b"")
+        identity = json.loads(head or b"")
     except ValueError:
-        known = None
-    if not isinstance(known, dict) or not isinstance(known.get("case"), dict):
+        identity = None
+    if not isinstance(identity, dict) or not isinstance(identity.get("case"), dict):
         raise Damaged(f"{file}: is damaged: its head cannot be read")
-    return known
+    return identity
 
 
 def identity(document: Document) -> dict[str, Any]:
@@ -190,16 +190,16 @@ def refuse_other(saved: dict[str, Any], document: Document, folder: Path) -> Non
         With the first difference; `OtherSources` if only the sources differ.
     """
     now, saved = _solved(identity(document)), _solved(saved)
-    there, here = saved.get("sources", saved.get("version")), now["sources"]
-    known = _of_case(saved)
-    if known != _of_case(now):
+    theirs, ours = saved.get("sources", saved.get("version")), now["sources"]
+    saved_case = _of_case(saved)
+    if saved_case != _of_case(now):
         raise CaseError(
-            f"--resume: {folder} belongs to another run: {_difference(known, now)}; "
+            f"--resume: {folder} belongs to another run: {_difference(saved_case, now)}; "
             "give another folder, or --overwrite in place of --resume"
         )
-    if there != here:
+    if theirs != ours:
         raise OtherSources(
-            f"--resume: {folder} was computed by other sources of magshell_fenicsx ({there}; these are {here}); "
+            f"--resume: {folder} was computed by other sources of magshell_fenicsx ({theirs}; these are {ours}); "
             "--overwrite in place of --resume computes it again"
         )
 
@@ -273,15 +273,15 @@ class Checkpoint:
         self.replayed += 1
         return self._decoded(content)
 
-    def record(self, found: Point | str) -> None:
+    def record(self, result: Point | str) -> None:
         """Put a result on disk."""
-        if isinstance(found, str):
-            self._append(json.dumps({"failure": found}).encode())
+        if isinstance(result, str):
+            self._append(json.dumps({"failure": result}).encode())
             return
         size = self._ordering.size
-        beyond = [self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1) for v in (found.state.u, found.du)]
-        u, du = (self._ordering.gather(v[:size]) for v in (found.state.u, found.du))
-        self._append(_encoded(found, u, du, beyond))
+        beyond = [self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1) for v in (result.state.u, result.du)]
+        u, du = (self._ordering.gather(v[:size]) for v in (result.state.u, result.du))
+        self._append(_encoded(result, u, du, beyond))
 
     def check(self, known: bool) -> None:
         pass
@@ -308,14 +308,14 @@ class Checkpoint:
 
     def _decoded(self, content: bytes) -> Point | str:
         text, _, data = content.partition(b"\n")
-        known = json.loads(text)
-        if "failure" in known:
-            return str(known["failure"])
+        decoded = json.loads(text)
+        if "failure" in decoded:
+            return str(decoded["failure"])
         u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
-        beyond = known.pop("beyond")
+        beyond = decoded.pop("beyond")
         if self._ordering.last:  # the numbers of a loading device
             u, du = (np.concatenate([v, more]) for v, more in zip((u, du), beyond, strict=True))
-        return Point(State(u, known.pop("mu")), du=du, **known)
+        return Point(State(u, decoded.pop("mu")), du=du, **decoded)
 
 
 def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> bytes:
@@ -324,10 +324,10 @@ def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> by
     return json.dumps({**numbers, "mu": point.state.mu, "beyond": beyond}).encode() + b"\n" + u.tobytes() + du.tobytes()
 
 
-def _difference(there: Any, here: Any, key: str = "") -> str:
+def _difference(saved: Any, present: Any, key: str = "") -> str:
     """The first key with different values, and both values."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        name = next(name for name in {**there, **here} if there.get(name) != here.get(name))
-        return _difference(there.get(name), here.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
-    values = ["nothing" if value is None else json.dumps(value) for value in (there, here)]
+    if isinstance(saved, dict) and isinstance(present, dict):
+        name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
+        return _difference(saved.get(name), present.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
+    values = ["nothing" if value is None else json.dumps(value) for value in (saved, present)]
     return f"{key} is {values[0]} there and {values[1]} here"

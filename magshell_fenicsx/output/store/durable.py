@@ -54,12 +54,12 @@ def read_object(file: Path) -> dict[str, Any]:
         If there is none.
     """
     try:
-        found = json.loads(read_result(file))
+        content = json.loads(read_result(file))
     except (ValueError, RecursionError) as e:
         raise Damaged(f"{file}: is damaged: no JSON: {e}") from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise Damaged(f"{file}: is damaged: no JSON object")
-    return found
+    return content
 
 
 def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> None:

@@ -78,9 +78,9 @@ def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], wha
     CaseError
         On the rank that calls.
     """
-    known = _object(folder / names[0])
-    if known.keys() >= set(kept):
-        name = known.get("case")
+    content = _object(folder / names[0])
+    if content.keys() >= set(kept):
+        name = content.get("case")
         if case and isinstance(name, str) and Path(name).stem != Path(case).stem:
             raise CaseError(f"--out {folder}: has {what} of {name}, which is kept; give another folder")
     elif not any(_object(file).keys() & OF_POINTS for file in (folder / "points").glob("*.json")):
@@ -91,10 +91,10 @@ def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], wha
 def _object(file: Path) -> dict[str, Any]:
     """The JSON object in a file; empty if there is none."""
     try:
-        known = json.loads(read_whole(file))
+        content = json.loads(read_whole(file))
     except (OSError, ValueError, RecursionError):
         return {}
-    return known if isinstance(known, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _is_filled(file: Path) -> bool:

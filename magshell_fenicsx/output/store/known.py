@@ -68,10 +68,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
     Damaged
         If it lacks something that reports and comparisons read.
     """
-    found = read_object(folder / SUMMARY)
-    if wrong := _unlike(found, SHAPE):
+    summary = read_object(folder / SUMMARY)
+    if wrong := _unlike(summary, SHAPE):
         raise Damaged(f"{folder / SUMMARY}: is damaged, or of an earlier version: {wrong}")
-    return found
+    return summary
 
 
 def _unlike(value: Any, kind: Any, key: str = "") -> str:
@@ -83,8 +83,8 @@ def _unlike(value: Any, kind: Any, key: str = "") -> str:
         inner = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
         for name in (name for name in inner if not name.endswith("?") and name not in value):
             return f"it has no {key}.{name}".replace(" .", " ")
-        known = {name: name.removesuffix("?") for name in inner}
-        within = [(value[k], inner[name], f"{key}.{k}") for name, k in known.items() if k in value]
+        names = {name: name.removesuffix("?") for name in inner}
+        within = [(value[k], inner[name], f"{key}.{k}") for name, k in names.items() if k in value]
     elif isinstance(kind, list | dict) or not isinstance(value, kind):
         return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
     return next((wrong for each in within if (wrong := _unlike(*each))), "")

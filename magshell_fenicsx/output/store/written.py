@@ -30,8 +30,8 @@ NAMES = re.compile(
 def of_names(folder: Path) -> set[str]:
     """What a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`; no link is followed."""
     parts = [folder, *([folder / "fields"] if _kind(folder / "fields") == "a folder" else [])]
-    there = {file.relative_to(folder).as_posix() for part in parts for file in part.iterdir()}
-    return {name for name in there if NAMES.fullmatch(name)} - ({"fields"} if len(parts) > 1 else set())
+    files = {file.relative_to(folder).as_posix() for part in parts for file in part.iterdir()}
+    return {name for name in files if NAMES.fullmatch(name)} - ({"fields"} if len(parts) > 1 else set())
 
 
 def _kind(file: Path) -> str:
@@ -49,20 +49,20 @@ def written(folder: Path) -> set[str]:
     earlier versions. The files of a path are, if checkpoint is, also after a kill, or without the list path.csv.
     What is no regular file is none of theirs.
     """
-    there = {name for name in of_names(folder) if not _kind(folder / name)}
-    found = {name for name in there if name.endswith(".unfinished")}  # left by a kill
-    text = read_result(folder / NAME).decode(errors="replace") if NAME in there else ""
+    present = {name for name in of_names(folder) if not _kind(folder / name)}
+    ours = {name for name in present if name.endswith(".unfinished")}  # left by a kill
+    text = read_result(folder / NAME).decode(errors="replace") if NAME in present else ""
     if replaced(folder):
-        found.add(NEW)
+        ours.add(NEW)
     if text.startswith(FIRST):
-        found |= there & {NAME, *text.splitlines()}
+        ours |= present & {NAME, *text.splitlines()}
     elif _is_of_run(lambda: read_object(folder / "summary.json")):
-        return there
+        return present
     if _is_of_run(lambda: checkpoint.begun_with(folder / checkpoint.NAME)) or (
-        NAME not in found and is_path(folder / "path.csv")
+        NAME not in ours and is_path(folder / "path.csv")
     ):
-        found |= {name for name in there if name in OF_PATH or name.startswith("fields/")}
-    return found
+        ours |= {name for name in present if name in OF_PATH or name.startswith("fields/")}
+    return ours
 
 
 def replaced(folder: Path) -> bool:
@@ -73,8 +73,8 @@ def replaced(folder: Path) -> bool:
 def _is_of_run(read: Callable[[], dict[str, Any] | None]) -> bool:
     """Whether a file has what a run depends on."""
     with suppress(OSError, Damaged):
-        known = read() or {}
-        return isinstance(known.get("case"), dict) and bool(known.keys() & {"sources", "versions"})
+        content = read() or {}
+        return isinstance(content.get("case"), dict) and bool(content.keys() & {"sources", "versions"})
     return False
 
 
