@@ -140,8 +140,8 @@ def example(
     from magshell_fenicsx.case.examples import examples, title, write_example
 
     if name is None:
-        for known, where in examples().items():
-            print_line(f"{known:24} {title(where)}")
+        for name_of_example, where in examples().items():
+            print_line(f"{name_of_example:24} {title(where)}")
         refuse_lost()
         return
     if world().rank:

@@ -54,8 +54,8 @@ def problem_of(given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[Ow
 
 def processes(given: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
     """Those that were asked for; else those of the mesh of a problem, or all."""
-    known = given.given if isinstance(given, Problem) else None
-    return comm or (known.home.comm if known and known.home else MPI.COMM_WORLD)
+    problem = given.given if isinstance(given, Problem) else None
+    return comm or (problem.home.comm if problem and problem.home else MPI.COMM_WORLD)
 
 
 class Scene(SceneOfProblem):

@@ -352,13 +352,13 @@ def _join(data: Keys, key: str, more: Keys) -> None:
     CaseError
         If something is, with another value.
     """
-    known = data.get(key, {})
-    if not isinstance(known, dict):
-        raise CaseError(f"{NAME}: {key}: {known!r}: must be a section, with keys below it")
+    section = data.get(key, {})
+    if not isinstance(section, dict):
+        raise CaseError(f"{NAME}: {key}: {section!r}: must be a section, with keys below it")
     for name, value in more.items():
-        if name in known and known[name] != value:
-            raise CaseError(f"{NAME}: {key}.{name}: is given twice, as {known[name]} and as {value}")
-    data[key] = {**known, **more}
+        if name in section and section[name] != value:
+            raise CaseError(f"{NAME}: {key}.{name}: is given twice, as {section[name]} and as {value}")
+    data[key] = {**section, **more}
 
 
 def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:

@@ -214,24 +214,24 @@ class Creases:
 
         count, grow = self.marks.ufl_shape[0], self.grow
 
-        def of(*arguments: Any, **known: Any) -> Any:
+        def of(*arguments: Any, **options: Any) -> Any:
             *given, (plus, minus), k, angle, has, grown = arguments
             r0, u, m = given[:3]
-            within, springs, joined = density.of(*given, **known), 0, 0
+            within, springs, joined = density.of(*given, **options), 0, 0
             stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
             first = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):
                 product = plus[i] * minus[i]
-                here = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
+                at_joint = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
                 s0, c0 = first
                 if grow:
                     placed = ufl.atan2(first[0], first[1])
                     rest = placed + grown * has[i] * (angle[i] - placed)
                     s0, c0 = ufl.sin(rest), ufl.cos(rest)
                 turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
-                springs += here * k[i] / 2 * turned**2 * stretch
-                joined += here
+                springs += at_joint * k[i] / 2 * turned**2 * stretch
+                joined += at_joint
             return (1 - joined) * within + springs
 
         more = (self.marks, self.stiffness, self.angle, self.given, factor)

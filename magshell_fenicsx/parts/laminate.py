@@ -124,9 +124,9 @@ class LaminateSection(Section):
         fractions = np.array([ply.fraction for ply in self.plies])
         ends = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
         Q = np.array([ply.stiffness[KEPT] for ply in self.plies]) / E
-        found = np.array([np.diff(ends**n) @ Q / n for n in (1, 2, 3)])
+        stiffnesses = np.array([np.diff(ends**n) @ Q / n for n in (1, 2, 3)])
         sizes = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
-        return np.where(np.abs(found) <= NONE * sizes, 0.0, found)
+        return np.where(np.abs(stiffnesses) <= NONE * sizes, 0.0, stiffnesses)
 
     def direction(self, geometry: str) -> Array | None:
         """The unit vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
@@ -179,10 +179,10 @@ class Laminated(Ability):
         """See that moduli and youngs_modulus go together, and that a mirror plane mirrors the plies."""
         section = self.section
         if section.with_units == isnan(given(context.shell).E):
-            there = (
+            moduli = (
                 "have a unit: youngs_modulus has none" if section.with_units else "have none: youngs_modulus has one"
             )
-            raise ValueError(f"shell.laminate.plies: their moduli {there}: give all of them a unit, or none")
+            raise ValueError(f"shell.laminate.plies: their moduli {moduli}: give all of them a unit, or none")
         section.refuse_unfit_sizes(context.shell.youngs_modulus or 1.0)
         context.needs("shell.laminate", "a mid-surface")
         if section.twists:

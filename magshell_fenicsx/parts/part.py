@@ -139,8 +139,8 @@ class Context:
             With the key and the points that there are.
         """
         if name is not None and name not in self.points:
-            known = ", ".join(self.points) or "none"
-            raise ValueError(f"{key}: {name}: name it in points, with its place; there are {known}")
+            named = ", ".join(self.points) or "none"
+            raise ValueError(f"{key}: {name}: name it in points, with its place; there are {named}")
 
     def on_shell(self, key: str, polar: float) -> None:
         """See that a direction from the centre of a sphere is a degree from its edge at least.

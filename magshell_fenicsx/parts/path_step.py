@@ -166,18 +166,18 @@ class PathStep(Step):
         goal = self.target
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
-        here = now.value if by_load else now.conjugate
+        begin_value = now.value if by_load else now.conjugate
         end = None if goal is None else goal[1] * (now.size if by_load else now.unit)
-        change = now.size if end is None else end - here
-        found: list[float] = []
+        change = now.size if end is None else end - begin_value
+        targets: list[float] = []
         if end is not None and self.until == "target":
-            begin = here if now.driven else self.begin(here)
-            found = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
-            found = [t for t in found if (t - here) * change > 0]
+            begin = begin_value if now.driven else self.begin(begin_value)
+            targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
+            targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":
-            found = [0.0]
+            targets = [0.0]
         first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
-        return Drive(self.prescribed, quantity, end, found, first, self.scale(now), step)
+        return Drive(self.prescribed, quantity, end, targets, first, self.scale(now), step)
 
     def course(self, here: Here) -> Course:
         until = "target" if self.until == "zero" else self.until

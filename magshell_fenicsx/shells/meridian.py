@@ -78,9 +78,9 @@ class Probe:
 
     def rows(self, size: int) -> Array:
         """(3, size): the same as a matrix."""
-        found = np.zeros((3, size // 2, 2))
-        found[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
-        return found.reshape(3, size)
+        matrix = np.zeros((3, size // 2, 2))
+        matrix[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
+        return matrix.reshape(3, size)
 
 
 class MeridianModel(Thin):
@@ -185,7 +185,7 @@ class MeridianModel(Thin):
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
-        stiffnesses = dict(known.history for known, _ in self.contacts.values())
+        stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
         self.system = FiniteElementSystem(
             self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves, history=stiffnesses
         )

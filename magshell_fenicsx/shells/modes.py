@@ -116,17 +116,17 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
-        found = self._lowest(_families(self.model, vibrating=True), state, count)
-        return found[: max(count, sum(mode.eigenvalue < 0 for mode in found))]
+        lowest = self._lowest(_families(self.model, vibrating=True), state, count)
+        return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
 
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
-        found = []
+        of_families = []
         for family in families:
             M = mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count)
-            found += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
-        return sorted(found, key=lambda mode: mode.eigenvalue)
+            of_families += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
+        return sorted(of_families, key=lambda mode: mode.eigenvalue)
 
     def null_vector(self, state: State, label: str) -> Vector:
         """The vector of the mode whose stiffness is nearest to zero: at a located instability the null vector.

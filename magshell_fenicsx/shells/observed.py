@@ -148,8 +148,8 @@ class Observed:
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named vertex."""
-        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
-        return np.asarray(self.system.comm.allreduce(here))
+        share = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
+        return np.asarray(self.system.comm.allreduce(share))
 
     def probe(self, point: str) -> Array:
         """Rows (3, size) that take the displacement at a named vertex from a vector, each rank its part."""

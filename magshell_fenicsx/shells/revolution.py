@@ -126,11 +126,11 @@ class Revolution:
         return np.concatenate([np.insert(pole, 1, 0.0, axis=1), circles.reshape(-1, 3)])
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
-        here = np.arange(sectors)
-        there = (here + 1) % sectors
-        cap = np.column_stack([0 * here, 1 + here, 1 + there])[: sectors * self._first]
+        sector = np.arange(sectors)
+        next_sector = (sector + 1) % sectors
+        cap = np.column_stack([0 * sector, 1 + sector, 1 + next_sector])[: sectors * self._first]
         inner = self._first + sectors * (self.ends[self._first :, :1] - self._first)
-        a, b, c, d = inner + here, inner + there, inner + sectors + here, inner + sectors + there
+        a, b, c, d = inner + sector, inner + next_sector, inner + sectors + sector, inner + sectors + next_sector
         bands = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, c, d), (a, d, b))]
         return np.concatenate([cap, *bands])
 

@@ -214,8 +214,8 @@ def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
     MeshError
         If the body has no such patch.
     """
-    found = field.on(body.patches, len(body.between))
-    return replace(found, remanent=_layered(field.layers, body)) if field.layers and not field.patches else found
+    own = field.on(body.patches, len(body.between))
+    return replace(own, remanent=_layered(field.layers, body)) if field.layers and not field.patches else own
 
 
 def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:

@@ -92,8 +92,8 @@ class Site:
             fill(self._g, geometry)
             blocks = Blocks(batch, self._coupled)
             for name in names:
-                for here, values in self._varying[name]:
-                    fill(here, values.latest[number])
+                for target, values in self._varying[name]:
+                    fill(target, values.latest[number])
                 blocks.add(self._points.evaluate(self._hessians[name], batch.size), factors[name], self._pairs[name])
             same[batch.cells[0]] += self._contraction.same(blocks, 0)
 
@@ -104,9 +104,9 @@ class Site:
     def _density(self, term: SolidTerm, v: fem.Function) -> Any:
         """A function of u, or of u and v with the Hessian in v that its virtual work has in symmetric part."""
         density, g, z = term.density, self._g, self._u
-        here, varying = parameters_at(self._points, density.parameters, 1)
+        at_points, varying = parameters_at(self._points, density.parameters, 1)
         of = density.work or density.of
-        self._varying[term.name] = [(here, on_batches(field, self._batches)) for here, field in varying]
+        self._varying[term.name] = [(at_points, on_batches(field, self._batches)) for at_points, field in varying]
 
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])
@@ -114,7 +114,7 @@ class Site:
         def second(W: Any) -> Any:
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
-        parameters = [vector(v, 0), *here] if density.work else here
+        parameters = [vector(v, 0), *at_points] if density.work else at_points
         if density.where == "outer":
             return second(of(*(vector(f, part) for f in (g, z) for part in range(3)), *parameters))
         by_reference = ufl.as_matrix([[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)])
@@ -128,23 +128,23 @@ def make_sites(
 ) -> list[Site]:
     """The sites of the terms that have a tangent, one for each quadrature, on all or some local cells. Collective."""
     V = X.function_space
-    found = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
+    nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     sites = []
-    for degree in sorted({t.density.degree for t in found if t.density.where == "body"}):
+    for degree in sorted({t.density.degree for t in nonlinear if t.density.where == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
         counted = cells if chosen is None else cells[chosen[cells]]
-        here = [t for t in found if t.density.where == "body" and t.density.degree == degree]
-        sites.append(Site(X, counted, _rule(V, points, w), here, log))
-    for term in found:
+        of_degree = [t for t in nonlinear if t.density.where == "body" and t.density.degree == degree]
+        sites.append(Site(X, counted, _rule(V, points, w), of_degree, log))
+    for term in nonlinear:
         if term.density.where == "body":
             continue
         around, numbers = _cells_at(body, term.density.facets)
         points, w = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
             rule = _rule(V, _on_facet(points, facet), w)
-            there = around[numbers == facet]
-            counted = there if chosen is None else there[chosen[there]]
+            at_facet = around[numbers == facet]
+            counted = at_facet if chosen is None else at_facet[chosen[at_facet]]
             sites.append(Site(X, counted, rule, [term], log, facet))
     return sites
 

@@ -67,16 +67,16 @@ class UnfoldedModes:
 
     def counts(self, state: State) -> Sequence[int]:
         """Unstable modes of the half that the sector excludes, and those that are antisymmetric to the half."""
-        half, there = self.half, State(self.unfolded(state.u), dict(state.mu))
+        half, state_of_half = self.half, State(self.unfolded(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))
         own = self._own.negative_pivots
-        self._others.factor(half.system.tangent(there.u, there.mu))
+        self._others.factor(half.system.tangent(state_of_half.u, state_of_half.mu))
         symmetric = self._others.negative_pivots - own
         modes = half.excluded_modes
         assert isinstance(modes, AntisymmetricModes)
-        factors = modes.factor_at(there)
+        factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
-        t = self._turning(there)
+        t = self._turning(state_of_half)
         if t is not None and dot(half.system.comm, t, factors.solve(t)) < 0:  # of the tangent on the complement of t
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]

@@ -116,10 +116,10 @@ class Waves:
         values = np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
         if not self._bands:
             self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
-        found = [0] * self.largest
+        unstable = [0] * self.largest
         for m in self._indefinite(values):
-            found[m - 1] = self._interpolated_pivots(m, values)
-        return found
+            unstable[m - 1] = self._interpolated_pivots(m, values)
+        return unstable
 
     def _entries(self, state: State, waves: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
         """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the system's displacement."""
@@ -194,8 +194,8 @@ class Waves:
 
     def unstable(self, state: State, largest: int | None = None) -> dict[int, int]:
         """m -> number of unstable directions, for the waves that have any."""
-        found = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
-        return {m: count for m, count in found.items() if count}
+        pivots = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
+        return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
         v, u = fem.Function(self.V), carriers.revolved(self._system.u)
@@ -233,10 +233,10 @@ def _lagrange(nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.i
 
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
     """The entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P - 2 V."""
-    found = entries.copy()
-    found[..., 1] = -2 * found[..., 0] - found[..., 1]
-    found[..., 1, :] = -2 * found[..., 0, :] - found[..., 1, :]
-    return found
+    mirrored = entries.copy()
+    mirrored[..., 1] = -2 * mirrored[..., 0] - mirrored[..., 1]
+    mirrored[..., 1, :] = -2 * mirrored[..., 0, :] - mirrored[..., 1, :]
+    return mirrored
 
 
 @dataclass(frozen=True)

@@ -68,13 +68,13 @@ class Departure:
 
     def record(self, number: int) -> Record:
         """The point in the model's own amplitudes and displacements."""
-        found = self.stage.point(self.point)
-        point = replace(found, state=self.scene.model.system.advance(found.state, found.state.mu))
+        own = self.stage.point(self.point)
+        point = replace(own, state=self.scene.model.system.advance(own.state, own.state.mu))
         of = {"branch": number, "excluded_pivots": self.unstable, "said": self.said, "scene": self.scene}
         return Record("step", self.path.name, point, **of)  # type: ignore[arg-type]
 
 
-def departed(stage: Stage, found: Record, scale: float) -> Departure:
+def departed(stage: Stage, bifurcation: Record, scale: float) -> Departure:
     """The bifurcation of a record in the smallest model that has its mode; collective.
 
     Parameters
@@ -90,30 +90,30 @@ def departed(stage: Stage, found: Record, scale: float) -> Departure:
         If there is no such model, or the bifurcation is not found in it.
     """
     stage.scene.progress.doing("handing over to the model that has the mode")
-    if found.mode in OWN_MODES:
-        path = _by_arc(stage, found.amplitude, scale)
-        state = stage.enter(found.point.state)
+    if bifurcation.mode in OWN_MODES:
+        path = _by_arc(stage, bifurcation.amplitude, scale)
+        state = stage.enter(bifurcation.point.state)
         try:
             phi = critical_mode(stage.newton, state).vector
         except NoEigenpair as e:
             raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
-        excluded = found.point
+        excluded = bifurcation.point
         point = _at(path, state, phi, excluded.negative_pivots, excluded.error, excluded.load_error)
-        return Departure(stage, path, point, unstable=found.excluded_pivots)
-    new = larger(stage.scene, found.mode)
+        return Departure(stage, path, point, unstable=bifurcation.excluded_pivots)
+    new = larger(stage.scene, bifurcation.mode)
     other = stage.on(new)
     try:
-        mode = ShellModes(stage.scene.model).null_vector(found.point.state, found.mode)
+        mode = ShellModes(stage.scene.model).null_vector(bifurcation.point.state, bifurcation.mode)
     except ModesNotFound as e:
-        raise Stopped(f"the mode of the bifurcation ({found.mode}) is not found: {e}") from None
-    u, phi = _carried(stage.scene, new, found, mode)
-    mu = {**new.unloaded().mu, **found.point.state.mu}
-    path = _by_arc(other, found.amplitude, scale)
+        raise Stopped(f"the mode of the bifurcation ({bifurcation.mode}) is not found: {e}") from None
+    u, phi = _carried(stage.scene, new, bifurcation, mode)
+    mu = {**new.unloaded().mu, **bifurcation.point.state.mu}
+    path = _by_arc(other, bifurcation.amplitude, scale)
     located = path.recorded(partial(_located, other, path, State(u, mu), phi))
     if isinstance(located, str):
-        raise Stopped(f"the bifurcation ({found.mode}) is not found in the {new.problem.included[0]}: {located}")
-    departure = Departure(other, path, located, unstable=found.excluded_pivots)
-    return replace(departure, said=_differences(stage.scene, found, departure))
+        raise Stopped(f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: {located}")
+    departure = Departure(other, path, located, unstable=bifurcation.excluded_pivots)
+    return replace(departure, said=_differences(stage.scene, bifurcation, departure))
 
 
 def larger(scene: Scene, mode: str) -> Scene:
@@ -141,7 +141,7 @@ def larger(scene: Scene, mode: str) -> Scene:
     raise Stopped(f"no model has the mode {mode}: {why}")
 
 
-def leaving(stage: Stage, found: Record, goal: Goal, scale: float, number: int) -> Records:
+def leaving(stage: Stage, bifurcation: Record, goal: Goal, scale: float, number: int) -> Records:
     """The records of the branch at a bifurcation in the model that has its mode; its value is the state at their end.
 
     One direction is followed: the other is the same shape, turned about e3 or mirrored.
@@ -156,11 +156,11 @@ def leaving(stage: Stage, found: Record, goal: Goal, scale: float, number: int) 
     Stopped
         If the branch is not found, or lost.
     """
-    departure = departed(stage, found, scale)
+    departure = departed(stage, bifurcation, scale)
     yield departure.record(number)
     crossing = branching(departure.path, departure.point)
     if crossing is None:
-        raise Stopped(f"the branch at the bifurcation ({found.mode}) is not found")
+        raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
     comm, u, phi = departure.scene.model.system.comm, departure.point.state.u, departure.point.du
     start = max(crossing.starts, key=lambda point: dot(comm, point.state.u - u, phi))
     records = Walked(branch(departure.stage, departure.path, start, goal, number))
@@ -186,28 +186,28 @@ def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str
     """The bifurcation near a guess, by its mode, in the system of a step."""
     state, mode = stage.enter(guess), stage.padded(phi)
     try:
-        found = find_bifurcation(stage.newton, state, mode, path.name)
+        located = find_bifurcation(stage.newton, state, mode, path.name)
     except BifurcationLost:
         return "Newton's method does not converge; take a finer mesh"
     comm = path.system.comm
-    sign = 1.0 if dot(comm, found.phi, mode) > 0 else -1.0
-    point = _at(path, found.state, sign * found.phi, found.unstable, found.error, found.load_error)
-    return replace(point, iterations=found.iterations, factorisations=found.factorisations)
+    sign = 1.0 if dot(comm, located.phi, mode) > 0 else -1.0
+    point = _at(path, located.state, sign * located.phi, located.unstable, located.error, located.load_error)
+    return replace(point, iterations=located.iterations, factorisations=located.factorisations)
 
 
-def _differences(old: Scene, found: Record, there: Departure) -> str:
+def _differences(old: Scene, event: Record, departure: Departure) -> str:
     """What handing over has changed, in words; collective."""
-    new, name = there.scene, found.amplitude
-    state = there.stage.point(there.point).state
-    one, two = old.observe(found.point.state), new.observe(state)
-    a, b = (amount_of(scene, name, s) for scene, s in ((old, found.point.state), (new, state)))
+    new, name = departure.scene, event.amplitude
+    state = departure.stage.point(departure.point).state
+    one, two = old.observe(event.point.state), new.observe(state)
+    a, b = (amount_of(scene, name, s) for scene, s in ((old, event.point.state), (new, state)))
     energy = abs(two["energy"] - one["energy"]) / max(abs(one["energy"]), TINY)
     counted = ""
     if new.problem.half:
         besides = ", but for its turning about e3" if new.problem.turns else ""
         counted = f"; its excluded_pivots are those of all other modes of the shell{besides}"
     return (
-        f"the branch of the mode ({found.mode}) is followed in the {new.problem.included[0]}, {new.model.system.dofs} "
+        f"the branch of the mode ({event.mode}) is followed in the {new.problem.included[0]}, {new.model.system.dofs} "
         f"unknowns: its bifurcation is at {amount(new, name, b)}, by {abs(b - a) / max(abs(a), TINY):.2g} of it beside "
         f"that of the {old.problem.included[0]}; the energy there differs by {energy:.2g} of it, w/h by "
         f"{abs(two['w_over_h'] - one['w_over_h']):.2g}{counted}"
@@ -219,12 +219,12 @@ def amount_of(scene: Scene, name: str, state: State) -> float:
     return state.mu.get(name, state.mu.get("lambda_m", 0.0))
 
 
-def _carried(old: Scene, new: Scene, found: Record, mode: Vector) -> tuple[Vector, Vector]:
+def _carried(old: Scene, new: Scene, bifurcation: Record, mode: Vector) -> tuple[Vector, Vector]:
     """Displacement and mode of a model in the unknowns of one with less symmetry; collective."""
-    system, u = new.model.system, found.point.state.u
+    system, u = new.model.system, bifurcation.point.state.u
     if isinstance(old.model, MeridianModel):
         s, theta = _along_meridian(old, new)
-        both = _revolved(old.model, s, theta, u, mode, int(found.mode.removeprefix(WAVES)))
+        both = _revolved(old.model, s, theta, u, mode, int(bifurcation.mode.removeprefix(WAVES)))
     else:
         both = _mirrored(old, new, u, mode)
     return system.held(both[0].ravel()), system.held(both[1].ravel())
@@ -286,8 +286,8 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     both = [np.concatenate([f, sign * f[off] @ S]) for f, sign in zip(fields, (1.0, -1.0), strict=True)]
     Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T  # from the new frame to the old one
     wanted = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
-    found = through(x, np.hstack(both), wanted)
-    return found[:, :3] @ Q, found[:, 3:] @ Q
+    at_nodes = through(x, np.hstack(both), wanted)
+    return at_nodes[:, :3] @ Q, at_nodes[:, 3:] @ Q
 
 
 def through(x: Array, values: Array, wanted: Array) -> Array:

@@ -93,9 +93,9 @@ class Rehearsed:
         """Choose steps with which the error at all rows is below the tolerance."""
         scene, tolerance = self.scene, steps.tolerance
         coarse = replace(steps, tolerance=max(tolerance, min(COARSER * tolerance, COARSEST)))
-        known = [(max_abs(scene.model.system.comm, now.v), now.t, dt) for now, dt in self._rows(coarse)]
-        speed, fastest, _ = max(known)
-        longest = max(dt for v, _, dt in known if v >= FAST * speed)
+        speeds = [(max_abs(scene.model.system.comm, now.v), now.t, dt) for now, dt in self._rows(coarse)]
+        speed, fastest, _ = max(speeds)
+        longest = max(dt for v, _, dt in speeds if v >= FAST * speed)
         coarse, part = replace(coarse, longest=longest, fastest=fastest), 1.0
         rows, ratio = [now.u for now, _ in self._rows(coarse)], 0.5
         while True:

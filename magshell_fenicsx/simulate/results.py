@@ -76,8 +76,8 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         point, i = points[of]
         by_u = scene.problem.length * (_turned(scene) @ model.probe(point))[i]
         return Functional(scene.observe(state)[of], system.held(by_u))
-    if of in (known := conjugates(scene)):
-        name, unit = known[of]
+    if of in (of_loads := conjugates(scene)):
+        name, unit = of_loads[of]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
         return Functional(value, by_u, potentials={name: -1 / unit})
@@ -100,16 +100,16 @@ def differentiable(scene: Scene, state: State) -> list[str]:
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
     rooms = (column for room in SEEN for column in room.differentiable(scene.problem.loads))
     amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.history)
-    found = dict.fromkeys(
+    columns = dict.fromkeys(
         ("energy", *conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *rooms, *amplitudes)
     )
-    return [*found, *scene.sizes.columns(found)]
+    return [*columns, *scene.sizes.columns(columns)]
 
 
 def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
     """The dimensionless column of a column in units, and the scale of its unit; else the column itself, and ""."""
     for name in differentiable(scene, state):
-        if (known := scene.sizes.column(name)) and known.name == of:
+        if (of_unit := scene.sizes.column(name)) and of_unit.name == of:
             return name, quantity(name).scale
     return of, ""
 
@@ -144,14 +144,14 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
     model, loads = scene.model, scene.problem.loads
-    found = {"volume_change": "pressure"} if loads.pressure else {}
-    found |= {column: name for room in SEEN for name, column in room.conjugates(loads).items()}
-    known = {column: (name, scene.conjugate_unit(name)) for column, name in found.items()}
+    amplitudes = {"volume_change": "pressure"} if loads.pressure else {}
+    amplitudes |= {column: name for room in SEEN for name, column in room.conjugates(loads).items()}
+    with_units = {column: (name, scene.conjugate_unit(name)) for column, name in amplitudes.items()}
     for name in (*loads.forces, *loads.dead):
         if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):
             column = "w_over_h" if name == loads.displaced else f"w_{name}_over_h"
-            known[column] = name, size * scene.problem.material.h
-    return known
+            with_units[column] = name, size * scene.problem.material.h
+    return with_units
 
 
 def _turned(scene: Scene) -> Array:
@@ -162,13 +162,13 @@ def _turned(scene: Scene) -> Array:
 def offset(scene: Scene, target: Target) -> fem.Function:
     """The displacement that reaches the target, at the nodes of the model."""
     model, Q = scene.model, rotation(scene.problem.azimuth)
-    found = fem.Function(model.V)
+    offsets = fem.Function(model.V)
     axes, r0 = model.axes, model.r0.x.array
     places = np.zeros((np.size(r0) // len(axes), 3))
     places[:, axes] = np.reshape(r0, (-1, len(axes)))
     wanted = target(places @ Q) @ Q.T
-    found.x.array[:] = (wanted - places)[:, axes].ravel()
-    return found
+    offsets.x.array[:] = (wanted - places)[:, axes].ravel()
+    return offsets
 
 
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:

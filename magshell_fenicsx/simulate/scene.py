@@ -87,9 +87,9 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> SolidModel:
     """The whole body or half of it, on all ranks together."""
 
     def factor(x: Array) -> Array:
-        found = (problem.thickness or Thickness()).at(x)
-        refuse_unfit(found, x, comm)
-        return found
+        thicknesses = (problem.thickness or Thickness()).at(x)
+        refuse_unfit(thicknesses, x, comm)
+        return thicknesses
 
     solid = problem.body
     assert solid
@@ -152,11 +152,12 @@ class Scene:
 
     def retuned(self, context: Context) -> "Scene":
         """The same model and solver for what differs by the strength of the field alone."""
-        found = object.__new__(Scene)
-        known = {name: of for name, of in vars(self).items() if name not in vars(Scene)}  # what is cached is found anew
+        other = object.__new__(Scene)
+        # what is cached is computed anew
+        attributes = {name: of for name, of in vars(self).items() if name not in vars(Scene)}
         problem = replace(self.problem, context=context, lambda_m=strength(context))
-        vars(found).update(known, problem=problem)
-        return found
+        vars(other).update(attributes, problem=problem)
+        return other
 
     @property
     def plan(self) -> Problem:
@@ -184,8 +185,8 @@ class Scene:
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
-        found = [known.lost for known in self.model.fields if known.lost]
-        said = [each for part in self.model.system.comm.allgather(found) for each in part]
+        lost_here = [known.lost for known in self.model.fields if known.lost]
+        said = [each for part in self.model.system.comm.allgather(lost_here) for each in part]
         return f"; on this way a step has found no field: {said[0]}" if said else ""
 
     @property
@@ -206,19 +207,19 @@ class Scene:
         """See `Record.u`; collective."""
         self.refuse_foreign(state, more=True)
         model, surface = self.model, self.model.midsurface
-        found = fem.Function(model.u.function_space, name="u")
-        found.x.array[:] = model.system.at(state).of(lambda: model.u.x.array.copy())
-        known = self.problem.given
-        if not (surface and known and known.home):
-            return found
+        displacement = fem.Function(model.u.function_space, name="u")
+        displacement.x.array[:] = model.system.at(state).of(lambda: model.u.x.array.copy())
+        given = self.problem.given
+        if not (surface and given and given.home):
+            return displacement
         if self.problem.half:
             raise ValueError("u: symmetry: half: half of the mesh is not modelled: take symmetry: none")
-        if MPI.Comm.Compare(self.comm, known.home.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+        if MPI.Comm.Compare(self.comm, given.home.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
-                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {known.home.comm.size}: "
+                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {given.home.comm.size}: "
                 "make the scene with those of the mesh, ms.Scene(problem)"
             )
-        return known.home.displacement(found, surface.given, known.scale)
+        return given.home.displacement(displacement, surface.given, given.scale)
 
     def refuse_foreign(self, state: State, *, more: bool = False) -> None:
         """Refuse a state of another scene, as far as it shows.
@@ -241,8 +242,8 @@ class Scene:
             )
         others = state.mu.keys() - own.mu.keys() - {*self.model.system.history}
         if own.mu.keys() - state.mu.keys() or (others and not more):
-            there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
-            raise ValueError(f"this state is of another scene: its amplitudes are {there}, those of this scene {here}")
+            theirs, ours = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
+            raise ValueError(f"this state is of another scene: its amplitudes are {theirs}, those of this scene {ours}")
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
@@ -281,11 +282,11 @@ class Scene:
 
     def energies(self, state: State) -> dict[str, float]:
         """The energy of each term, over E h R^2; all parts of one field together."""
-        model, found = self.model, defaultdict[str, float](float)
+        model, by_group = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
         for t in model.system.terms:
-            found[t.group] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
-        return found
+            by_group[t.group] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
+        return by_group
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
@@ -347,11 +348,11 @@ class Scene:
 
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""
-        found: dict[str, float] = {}
+        displacements: dict[str, float] = {}
         for point in self.problem.context.points:
             u = self.problem.length * self.model.displacement(state.u, point) @ rotation(self.problem.azimuth)
-            found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
-        return found
+            displacements |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
+        return displacements
 
 
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
@@ -359,11 +360,11 @@ def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
     if comm.size == 1:
         return refuse_beyond_memory(problem)
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
-    here = machine.size
+    ranks_of_machine = machine.size
     machine.Free()
     said: str | CaseError | None
     try:
-        said = refuse_beyond_memory(problem, comm.size, here)
+        said = refuse_beyond_memory(problem, comm.size, ranks_of_machine)
     except CaseError as e:
         said = e
     every = comm.allgather(said)

@@ -103,7 +103,7 @@ def searched(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> Ite
 
 def solutions(
     scene: Scene,
-    known: Record | State,
+    start: Record | State,
     *,
     most: int = 3,
     guesses: int = 12,
@@ -126,9 +126,9 @@ def solutions(
     Stopped
         If the known state is no equilibrium.
     """
-    state = known.point.state if isinstance(known, Record) else known
+    state = start.point.state if isinstance(start, Record) else start
     scene.refuse_foreign(state)
-    name = known.amplitude if isinstance(known, Record) and known.amplitude in state.mu else next(iter(state.mu))
+    name = start.amplitude if isinstance(start, Record) and start.amplitude in state.mu else next(iter(state.mu))
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
@@ -149,8 +149,8 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     limits = Limits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
     descend = dents.descended if search.stable else None
-    for number, found in enumerate(further(path, stage.enter(state), made, limits, stage.displaced, descend), 1):
-        point = stage.point(found)
+    for number, solution in enumerate(further(path, stage.enter(state), made, limits, stage.displaced, descend), 1):
+        point = stage.point(solution)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
 

@@ -106,13 +106,13 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     if problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
     none = dict.fromkeys(("magnetic.remanent.flux_density", "magnetic.applied.flux_density"))
-    there = problem.again({"magnetic.lambda_m": SOME_FIELD, **none})
+    with_field = problem.again({"magnetic.lambda_m": SOME_FIELD, **none})
     whole = not problem.axisymmetric and problem.mirror is None
-    alike = (there.axisymmetric, there.mirror) == (problem.axisymmetric, problem.mirror)
-    assert there.loads.magnetic
+    alike = (with_field.axisymmetric, with_field.mirror) == (problem.axisymmetric, problem.mirror)
+    assert with_field.loads.magnetic
     size = scene.model.system.size
     own = State(state.u[:size], state.mu)
-    return {"lambda_m": _magnetic_column(scene, own, there.loads.magnetic)} if whole or alike else {}
+    return {"lambda_m": _magnetic_column(scene, own, with_field.loads.magnetic)} if whole or alike else {}
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,8 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
     """The model's terms of a remanence with another one, in the fields of a state; none of what is soft alone."""
     terms, fields = _made(scene, field)
-    for known in fields:
-        known.mu.update({name: state.mu.get(name, 0.0) for name in known.names})
+    for applied in fields:
+        applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
     return terms
 
 

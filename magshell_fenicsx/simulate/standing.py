@@ -33,11 +33,11 @@ class Standing:
         MeshError
             If it cannot be made.
         """
-        known, self.scene = self.scene, None
-        if known is None or not refilled(known, problem):
-            known = Scene(problem, comm)
-        self.scene = known
-        return known
+        standing, self.scene = self.scene, None
+        if standing is None or not refilled(standing, problem):
+            standing = Scene(problem, comm)
+        self.scene = standing
+        return standing
 
 
 def refilled(scene: Scene, problem: Problem) -> bool:
@@ -93,11 +93,11 @@ def _patches(problem: Problem) -> bool:
 
 def _put(model: ShellModel | MeridianModel, problem: Problem) -> None:
     magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
-    there = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
+    coefficients = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
     if magnetic and callable(magnetic.remanent):
-        there["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
+        coefficients["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
     if problem.thickness and model.thickness:
         patches = model.midsurface.patches if model.midsurface else {}
         model.thickness.x.array[:] = thickness_field(problem.thickness, r0, patches).x.array
     if natural:
-        there["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array
+        coefficients["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array

@@ -69,7 +69,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     return walked.end
 
 
-def followed_on(scene: Scene, step: ProgrammeStep, found: Record) -> Records:
+def followed_on(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Records:
     """The records of the branch at the bifurcation that ends a step, to its target or for `points` steps.
 
     The model is the smallest that has the mode, and so is that of the state at the end.
@@ -79,16 +79,16 @@ def followed_on(scene: Scene, step: ProgrammeStep, found: Record) -> Records:
     Stopped
         If the branch is not found, or lost.
     """
-    stage, drive = stage_of(scene, step, found.point.state), _drive(scene, step, found.point.state)
+    stage, drive = stage_of(scene, step, bifurcation.point.state), _drive(scene, step, bifurcation.point.state)
     end = drive.end
     goal = Goal("points", steps=step.load.points) if end is None else Goal("target", [end], drive.quantity)
-    return (yield from leaving(stage, found, goal, abs(drive.scale), 0))
+    return (yield from leaving(stage, bifurcation, goal, abs(drive.scale), 0))
 
 
-def departure_of(scene: Scene, step: ProgrammeStep, found: Record) -> Departure:
+def departure_of(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Departure:
     """The bifurcation that ends a step, in the model that has its mode."""
-    scale = abs(_drive(scene, step, found.point.state).scale)
-    return departed(stage_of(scene, step, found.point.state), found, scale)
+    scale = abs(_drive(scene, step, bifurcation.point.state).scale)
+    return departed(stage_of(scene, step, bifurcation.point.state), bifurcation, scale)
 
 
 def leaves_path(step: ProgrammeStep) -> bool:

@@ -51,8 +51,8 @@ def _number(scene: Scene, name: str, where: str, amount: Any, of_load: bool) -> 
         return float(amount)
     if not isinstance(amount, str):
         raise ValueError(f'{where}: must be a number, or text with a unit such as "100 Pa"')
-    known = amplitude(name)
-    column = known.column if of_load else known.conjugate
+    varied = amplitude(name)
+    column = varied.column if of_load else varied.conjugate
     unit, scale = scene.sizes.unit(column), quantity(column).scale
     sized = of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
     text = unit.text if unit else next((each.text for each in quantity(column).units), "")
@@ -141,13 +141,13 @@ def trace(
         moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), exact=True).du
         if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
             raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
-    path, here = plain(scene).begin(name, control, rest.state, first, 10 * first)
+    path, first_point = plain(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
-        step = abs(targets[-1] - here.s) / 10
+        step = abs(targets[-1] - first_point.s) / 10
         path = path.in_steps(StepOptions(step, 2 * step, 1e-5 * step))
-    sense = float(np.copysign(1.0, first * here.dmu))
-    found = followed(plain(scene), path, here, Goal(until, targets, quantity, steps, sense))
-    records = chain([Record("start", "", here)], found)
+    sense = float(np.copysign(1.0, first * first_point.dmu))
+    records_of_path = followed(plain(scene), path, first_point, Goal(until, targets, quantity, steps, sense))
+    records = chain([Record("start", "", first_point)], records_of_path)
     yield from _marked((replace(record, shown=scene.displacement) for record in records), name, targets)
 
 

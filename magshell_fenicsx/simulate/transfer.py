@@ -55,14 +55,14 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
     inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
-    for here, wanted in (inside, outside):
+    for side, wanted in (inside, outside):
         if wanted.any():
             dim = nodes.shape[1]
             kernel, degree = (
                 ("quintic", 3) if dim < 3 else ("linear", 0)
             )  # cubic polynomials may vanish on a surface in space
             field = scipy.interpolate.RBFInterpolator(
-                nodes[here], values[here], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
+                nodes[side], values[side], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
             )
             values_at[wanted] = field(x[wanted])
     return values_at
@@ -107,11 +107,11 @@ class _Stretch:
         """Displacements u (n, 2 or 3) of the source, rotated and scaled for points x of the target."""
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
-        there, here = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
-        across, along = (np.sum(u * e, axis=1, keepdims=True) for e in there)
-        sideways = u - across * there[0] - along * there[1]
+        from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
+        across, along = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
+        sideways = u - across * from_frame[0] - along * from_frame[1]
         ratio = self.rim / self.source_rim
-        return np.asarray(ratio**2 * (across * here[0] + (along * here[1] + sideways) / self._slope(polar)))
+        return np.asarray(ratio**2 * (across * to_frame[0] + (along * to_frame[1] + sideways) / self._slope(polar)))
 
     def _polar(self, polar: Array) -> Array:
         t = self._beyond(polar)

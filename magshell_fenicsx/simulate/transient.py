@@ -65,8 +65,8 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     axes = model.axes
     places = in_space(model.r0.x.array, len(axes))
-    found = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
-    return np.asarray(model.system.held(np.ascontiguousarray(found[:, axes]).ravel()[: model.system.size]))
+    velocity = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
+    return np.asarray(model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]))
 
 
 def own_time(value: Time) -> float:
@@ -112,8 +112,8 @@ class LoadsInTime:
         for name, history in histories.items():
             # histories are in the case's own unit of time
             driven = steps.get(name)
-            here = driven.in_history(state.mu[name]) if driven else state.mu[name]
-            of = curve(history, own_time, partial(level_of, problem, name), here)
+            value = driven.in_history(state.mu[name]) if driven else state.mu[name]
+            of = curve(history, own_time, partial(level_of, problem, name), value)
             size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(of, size, unit, driven.of_history if driven else float)
             self.marks |= set(marks(history, time, time(load.duration)))
@@ -176,7 +176,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             ground = Ground(
                 system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried
             )
-        pressings = {name: known for name, (known, _) in scene.model.contacts.items()}
+        pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
         touching = Pressings(system, pressings) if pressings else None
         integrator = Integrator(
             system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
@@ -243,8 +243,8 @@ def _watched(scene: Scene, event: EventSection | None, state: State) -> Callable
     """What changes its sign at an event; None without one."""
     if event is None:
         return None
-    if event.column not in (known := scene.observe(state)):
-        raise CaseError(f"loading: event.column: {event.column}: no such column; allowed: {', '.join(known)}")
+    if event.column not in (columns := scene.observe(state)):
+        raise CaseError(f"loading: event.column: {event.column}: no such column; allowed: {', '.join(columns)}")
 
     def beyond(now: Motion) -> float:
         return scene.observe(scene.model.system.placed(State(now.u, now.mu)))[event.column] - event.value
@@ -257,13 +257,13 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     problem, shell = scene.problem, scene.problem.context.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
-    model, found = scene.model, list[Branch]()
+    model, branches = scene.model, list[Branch]()
     for branch in shell.relaxation:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
-        found.append(Branch(ratio, time_of(problem, branch.time)))
+        branches.append(Branch(ratio, time_of(problem, branch.time)))
     assert model.thin
-    return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), found)
+    return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), branches)
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:
@@ -305,5 +305,5 @@ def _rest(scene: Scene, held: Mapping[str, Held], state: State) -> State | None:
     moved = max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
     if not outcome.converged or moved > NEAR or stage.newton.factor_at(outcome.state).negative_pivots:
         return None
-    found = stage.leave(outcome.state)
-    return State(found.u, state.mu | {name: found.mu[name] for name in held})
+    at_rest = stage.leave(outcome.state)
+    return State(at_rest.u, state.mu | {name: at_rest.mu[name] for name in held})

@@ -217,14 +217,14 @@ class Varied:
         return self._problems[p]
 
     def _stage(self, p: float) -> Stage:
-        found = self._stages.pop(p, None)
-        if found is None:
+        stage = self._stages.pop(p, None)
+        if stage is None:
             scene = self._scene(p)
-            found = self._base.on(scene) if self._base.device or self._base.along else Stage(scene, scene.newton)
-        self._stages[p] = found
+            stage = self._base.on(scene) if self._base.device or self._base.along else Stage(scene, scene.newton)
+        self._stages[p] = stage
         while len(self._stages) > KEPT:
             self._stages.pop(next(iter(self._stages)))
-        return found
+        return stage
 
     def _scene(self, p: float) -> Scene:
         """The scene at a value, on the mesh of the first one in its chart."""
@@ -245,8 +245,8 @@ class Varied:
     def _mu(self, p: float) -> dict[str, float]:
         """The amplitudes of the model at the instability, those that are given being those of another problem."""
         if self._line:
-            at, known, rates = self._line
-            return {name: v + rates[name] * (p - at) for name, v in known.items()}
+            at, amplitudes, rates = self._line
+            return {name: v + rates[name] * (p - at) for name, v in amplitudes.items()}
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
         for before, after in zip(old.programme[: self._record.step - 1], new.programme, strict=False):
             one, two = before.load.target, after.load.target
@@ -276,11 +276,11 @@ class Varied:
             return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
 
         self._stages[other] = stage = self._stage(other)
-        here, there, moved_only = forces(self._base, value), forces(stage, other), forces(self._base, other)
-        size = max_abs(comm, here) or 1.0
-        if max_abs(comm, there - here) <= SAME * size:
+        before, after, moved_only = forces(self._base, value), forces(stage, other), forces(self._base, other)
+        size = max_abs(comm, before) or 1.0
+        if max_abs(comm, after - before) <= SAME * size:
             raise NoInfluence("it has no influence on this instability")
-        return max_abs(comm, there - moved_only) <= SAME * size
+        return max_abs(comm, after - moved_only) <= SAME * size
 
     def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
         mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu

@@ -77,8 +77,8 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     path, start, goal = walk.path, walk.points[0], walk.goal
     crossing, fold, lost, watch = None, "", "", stage.scene.watch
     furthest = np.inf  # amplitude, once an excluded mode is unstable
-    for known in stage.scene.model.fields:
-        known.lost = ""
+    for applied in stage.scene.model.fields:
+        applied.lost = ""
     watch.begin(path, start, stage.leave)
     onward: Walk | None = walk
     while onward:
@@ -95,9 +95,9 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 if excluded and goal.until == "limit":
                     furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
                 if label == "bifurcation":
-                    here = branching(_by_arc(stage, path), point)
-                    crossing = crossing or here
-                    mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
+                    crossing_at_point = branching(_by_arc(stage, path), point)
+                    crossing = crossing or crossing_at_point
+                    mode = ("symmetric" if crossing_at_point.symmetric else "asymmetric") if crossing_at_point else ""
                 if label == "fold":
                     fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
                 yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
@@ -119,10 +119,10 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
             lost = ""
             watch.begin(onward.path, onward.points[0], stage.leave)
     if lost and path.control == "load" and goal.targets:
-        for found in _fold_ahead(stage, path, walk.points):
-            yield found
-            if found.label == "fold":
-                at = amount(stage.scene, path.name, found.point.state.mu[path.name])
+        for record in _fold_ahead(stage, path, walk.points):
+            yield record
+            if record.label == "fold":
+                at = amount(stage.scene, path.name, record.point.state.mu[path.name])
                 target = amount(stage.scene, path.name, goal.targets[-1])
                 lost = f"load control cannot pass the fold at {at}, before its target, {target}; {lost}"
     if watch.unlocated:
@@ -181,13 +181,13 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
     yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
     try:
         for label, point in walk:
-            for found in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
-                yield replace(found, branch=number)
+            for record in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
+                yield replace(record, branch=number)
             yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
     except PathStopped as e:
         lost = _why(stage.scene, path, e, walk.points)
-    for found in _excluded(path, watch.end()):
-        yield replace(found, branch=number)
+    for record in _excluded(path, watch.end()):
+        yield replace(record, branch=number)
     if lost:
         raise Stopped(lost)
     return walk.points[-1].state
@@ -204,46 +204,48 @@ def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
     by_arc, start = stage.resume(path.name, "arc", points[-1].state, onward, path.metric.scale)
     stage.scene.watch.begin(by_arc, start, stage.leave)
-    found: list[Record] = []
+    passed: list[Record] = []
     try:
         for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
-            found += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
+            passed += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
     except PathStopped:
         return []
     return (
-        [*found, Record(label, path.name, point, excluded_pivots=stage.scene.watch.unstable)] if label == "fold" else []
+        [*passed, Record(label, path.name, point, excluded_pivots=stage.scene.watch.unstable)]
+        if label == "fold"
+        else []
     )
 
 
 def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Records of the points where excluded modes become unstable or stable."""
-    for found in crossings:
-        yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
+    for crossing in crossings:
+        yield Record("bifurcation", path.name, crossing.point, crossing.label, excluded_pivots=crossing.unstable)
 
 
 def amount(scene: Scene, name: str, value: float) -> str:
     """The value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
     column = amplitude(name).column
-    known = scene.sizes.column(column)
-    measured = known and f" ({value * scene.sizes.size(column):.6g} {known.si})"
+    in_units = scene.sizes.column(column)
+    measured = in_units and f" ({value * scene.sizes.size(column):.6g} {in_units.si})"
     return f"{name} = {value:.6g}{measured or ''}"
 
 
 def _why(scene: Scene, path: Path, stop: PathStopped, points: list[Point]) -> str:
     """The message for a lost path; it names a fold in the controlled quantity."""
-    here = stop.point
-    where = f"the last point has {amount(scene, path.name, here.state.mu[path.name])}: {stop}"
+    last = stop.point
+    where = f"the last point has {amount(scene, path.name, last.state.mu[path.name])}: {stop}"
     if path.control == "load":
         return f"load control stopped; {where}. To pass a limit point, use control: arc"
-    before = points[-2] if len(points) > 1 else here
-    if path.control == "arc" or before.dmu == here.dmu:
+    before = points[-2] if len(points) > 1 else last
+    if path.control == "arc" or before.dmu == last.dmu:
         return f"the controlled path stopped; {where}"
     # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
-    a, b = before.dmu**-2, here.dmu**-2
-    ahead = b * (here.s - before.s) / (a - b) if a > b else np.inf
-    if 0 < ahead / (here.s - before.s) < 10:
+    a, b = before.dmu**-2, last.dmu**-2
+    ahead = b * (last.s - before.s) / (a - b) if a > b else np.inf
+    if 0 < ahead / (last.s - before.s) < 10:
         return (
-            f"the path turns back in the controlled displacement, {ahead / here.s:.2%} beyond the last point: "
+            f"the path turns back in the controlled displacement, {ahead / last.s:.2%} beyond the last point: "
             f"a fold that displacement control cannot pass, but control: arc can; {where}"
         )
     return f"the controlled path stopped; {where}"

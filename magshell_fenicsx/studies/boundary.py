@@ -206,8 +206,8 @@ def boundary(
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
         compute(senses, followed, comm, say)
-        found = by_first(comm, lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses})
-        done = _put_together(found, begin, span, name, settings)
+        outcomes = by_first(comm, lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses})
+        done = _put_together(outcomes, begin, span, name, settings)
         by_first(comm, lambda: _write(done, folder))
     for line in done.content["said"]:
         once(line)
@@ -278,12 +278,12 @@ class _Journal:
     def recorded(self, solve: Callable[[], Locus | str]) -> Locus | str:
         """The result of a solve, or that of an interrupted boundary at this place."""
         name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
-        if (known := self._kept(name)) is not None:
-            return _locus(known) if "state" in known else str(known["reason"])
-        found = solve()
-        content = {"reason": found} if isinstance(found, str) else _as_data(found)
+        if (saved := self._kept(name)) is not None:
+            return _locus(saved) if "state" in saved else str(saved["reason"])
+        solved = solve()
+        content = {"reason": solved} if isinstance(solved, str) else _as_data(solved)
         keep(self._folder / f"{name}.json", {"sources": code_version(), "outcome": content})
-        return found
+        return solved
 
     def _kept(self, name: str) -> dict[str, Any] | None:
         return kept(self._folder / f"{name}.json", ANY, "outcome", sources=code_version())
@@ -405,10 +405,10 @@ def _row(varied: Varied, label: Label, locus: Locus) -> dict[str, Any]:
 
 
 def _put_together(
-    found: dict[int, dict[str, Any]], begin: dict[str, Any], span: Range, name: str, settings: Sequence[str]
+    outcomes: dict[int, dict[str, Any]], begin: dict[str, Any], span: Range, name: str, settings: Sequence[str]
 ) -> StabilityBoundary:
     """Both directions as one curve, and what it says."""
-    down, up = (found.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
+    down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
     said = [

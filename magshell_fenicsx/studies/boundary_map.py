@@ -90,15 +90,15 @@ def boundary_map(
             once(f"{axis.name} = {value}, {number} of {len(axis.values)}")
             own = [*settings, f"{axis.name}={value}"]
             try:
-                found = boundary(file, overs[0], own, folder / "boundaries" / f"{number:03d}", comm, say, made=made)
+                one = boundary(file, overs[0], own, folder / "boundaries" / f"{number:03d}", comm, say, made=made)
             except (Excluded, NoInstability, Stopped) as e:
                 without[value] = str(e)
                 once(f"{axis.name} = {value}: no boundary: {e}")
                 continue
             except CaseError as e:
                 raise CaseError(str(e).replace(f"--set {own[-1]}", f"--over {own[-1]}")) from None
-            lines[value] = found
-            rows += [{"second": axis.number(value), "amplitude": found.content["load"], **row} for row in found.rows]
+            lines[value] = one
+            rows += [{"second": axis.number(value), "amplitude": one.content["load"], **row} for row in one.rows]
         if not rows:
             raise CaseError(f"--over {overs[1]}: the case has an instability at none of these values")
         content = _content(file, settings, lines, without, axis)

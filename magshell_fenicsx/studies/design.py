@@ -84,9 +84,9 @@ class Design:
     def __call__(self, x: Array) -> Evaluation:
         """The evaluation of a vector, known or new; collective."""
         x = np.array(self.comm.bcast(x))
-        for tried, known in reversed(self.tried):
+        for tried, evaluated in reversed(self.tried):
             if np.array_equal(tried, x):
-                return known
+                return evaluated
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
@@ -121,13 +121,13 @@ class Design:
 
     def _add(self, x: Array, evaluation: Evaluation, name: str) -> None:
         self.tried.append((x, evaluation))
-        best, there = self.best, bool(evaluation.values)
+        best, solved = self.best, bool(evaluation.values)
         row = {
             "evaluation": len(self.rows) + 1,
             **{result: evaluation.values.get(result) for result in self.wanted.results},
             **evaluation.seen,
-            "objective": self.wanted.objective(evaluation) if there else None,
-            "violation": self.wanted.violation(evaluation) if there else None,
+            "objective": self.wanted.objective(evaluation) if solved else None,
+            "violation": self.wanted.violation(evaluation) if solved else None,
             "best": bool(best and best[0] is x),
             **self.variables.numbers(x),
             **({"stage": self.stage or "last"} if self.wanted.stages else {}),
@@ -155,8 +155,8 @@ class Design:
     @property
     def best(self) -> tuple[Array, Evaluation] | None:
         """The evaluation with the least objective of those that keep the constraints best."""
-        there = [each for each in self.tried if each[1].values]
-        return min(there, key=lambda each: self.wanted.merit(each[1])) if there else None
+        solved = [each for each in self.tried if each[1].values]
+        return min(solved, key=lambda each: self.wanted.merit(each[1])) if solved else None
 
 
 def design(

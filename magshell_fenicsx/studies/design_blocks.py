@@ -61,8 +61,8 @@ class Number(Bounded):
         """The key with its unit, if it has one."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        slope = found.get(self.name, 0.0)
+    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
+        slope = gradients.get(self.name, 0.0)
         return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
 
     def put(self, data: dict[str, Any], x: Array) -> None:
@@ -123,8 +123,8 @@ class Vectors:
         """At the points, (n, 3) or (n, 2)."""
         return self._polar(x)[0]
 
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        if not isinstance(by := found.get(self.name), FieldGradient):
+    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
+        if not isinstance(by := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         magnetic = scene.problem.loads.magnetic
         assert magnetic
@@ -153,8 +153,8 @@ class Vectors:
         return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
-        known = data["magnetic"].get("remanent") or {}
-        kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
+        remanent = data["magnetic"].get("remanent") or {}
+        kept = {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
         data["magnetic"]["remanent"] = {"kind": "points", "file": "", "filter": self.controls.width, **kept}
 
 
@@ -174,8 +174,8 @@ class Between(Bounded):
     controls: Controls
     length: float = 1.0
 
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        if not isinstance(by := found.get(self.name), FieldGradient):
+    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
+        if not isinstance(by := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         places = by.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
         forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]

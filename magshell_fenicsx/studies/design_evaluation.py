@@ -70,13 +70,13 @@ def evaluate(
     results: Sequence[str],
     targets: Mapping[str, Target],
     comm: MPI.Comm,
-    known: Standing,
+    standing: Standing,
 ) -> Evaluation:
     """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
     lost, named = "", variables.case.design.named
     records, history, remarks = list[Record](), History(), list[str]()
     try:
-        scene = known.of(case.problem(), comm)
+        scene = standing.of(case.problem(), comm)
         for result in results:
             if result != MASS and result not in targets:
                 refuse_no_result(scene, [result], named[result], more=[MASS])

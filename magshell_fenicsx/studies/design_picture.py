@@ -155,8 +155,8 @@ def _unit(result: str) -> str:
     >>> [_unit(name) for name in ("buckling_pressure_Pa", "tip_uz_mm", "w_mm", "knockdown", "w_over_h", "hertz_2")]
     ['Pa', 'mm', 'mm', 'load', 'h', 'Hz']
     """
-    if found := re.fullmatch(r"(omega2|hertz)_\d+", result):
-        return {"omega2": "omega2", "hertz": "Hz"}[found[1]]
+    if matched := re.fullmatch(r"(omega2|hertz)_\d+", result):
+        return {"omega2": "omega2", "hertz": "Hz"}[matched[1]]
     if given := split_unit(result):
         return given[1]
     own = {"critical_field": quantity("lambda_m").scale, "barrier": quantity("energy").scale, "shape": "shape"}

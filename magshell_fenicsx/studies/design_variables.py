@@ -92,10 +92,10 @@ class Variables:
         assert self.remanence
         return self.remanence.vectors(x[self.blocks["remanence"]])
 
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
+    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
         """A gradient by the vector from those of `simulate.gradients`; by what is not among them it is zero."""
         blocks = self.blocks
-        return np.concatenate([part.gradient(x[blocks[part.name]], scene, found) for part in self.parts])
+        return np.concatenate([part.gradient(x[blocks[part.name]], scene, gradients) for part in self.parts])
 
     def rounded(self, x: Array, steps: int) -> Array:
         """The vector with angles of the remanence at the nearest of so many steps of a turn."""

@@ -290,9 +290,9 @@ def _raised(
     last = _last_known(evaluated)
 
     def above(z: Array) -> Array:
-        evaluation, known = last(z[:-1])
+        evaluation, converged = last(z[:-1])
         values: Array = np.concatenate([goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)])
-        return values if known else np.full_like(values, -WORSE)
+        return values if converged else np.full_like(values, -WORSE)
 
     def slopes(z: Array) -> Array:
         evaluation, _ = last(z[:-1])

@@ -212,11 +212,11 @@ def _write(rows: Sequence[Row], content: Mapping[str, Any], folder: Path, ending
     write_whole(folder / f"report{ending}.md", report(content, rows, ending).encode())
 
 
-def solve(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
+def solve(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
     """Compute a sample on this rank; an error ends the sample, not the ensemble."""
     start, cpu = time.perf_counter(), time.process_time()
     try:
-        outcome = _solved(sample, scalar, known)
+        outcome = _solved(sample, scalar, folds)
     except Exception as e:  # whatever it is, the other samples go on, and the table names it
         why = f"{FAILED}{'' if isinstance(e, MeshError) else f'{type(e).__name__}: '}{e}"
         outcome = Outcome.failed(" ".join(why.split()))
@@ -224,18 +224,18 @@ def solve(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
     return replace(outcome, wall_s=round(wall_s, 3), cpu_s=round(cpu_s, 3))
 
 
-def _solved(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
+def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
         return _outcome(run(problem, comm=MPI.COMM_SELF))
     scene = Scene(problem, MPI.COMM_SELF)
     try:
-        return _of_fold(scene, known.follow(sample.values, scene))
+        return _of_fold(scene, folds.follow(sample.values, scene))
     except FoldLost:
-        return _along_path(sample, scene, known)
+        return _along_path(sample, scene, folds)
 
 
-def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
+def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     """The fold from the first point of the path that leads to it, or the end of the path."""
     result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
@@ -250,7 +250,7 @@ def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
             if guess is None:
                 continue
             try:
-                fold = known.polished(sample.values, scene, guess)
+                fold = folds.polished(sample.values, scene, guess)
             except FoldLost:
                 continue
             if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:

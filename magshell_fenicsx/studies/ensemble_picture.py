@@ -81,10 +81,10 @@ def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull
 def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
     """The result over a column, with Spearman's correlation and how likely one as large is by chance."""
     pairs = np.array([(row[key], row[RESULT]) for row in rows if row[RESULT] is not None and row.get(key) is not None])
-    found, chance = correlation(*pairs.T)
+    rho, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
     likely = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
-    number = f"{found:.2f}".replace("-", "−")
+    number = f"{rho:.2f}".replace("-", "−")
     axes.set(xlabel=words(key), ylabel=label)
     axes.set_title(f"Spearman's correlation {number}, $n$ = {len(pairs)}, {likely}", fontsize=9)
 
@@ -99,16 +99,16 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     """
     from scipy.stats import permutation_test, rankdata, spearmanr
 
-    found, chance = spearmanr(x, y)
-    if len(x) >= FEW or np.isnan(found):
-        return float(found), float(chance)
+    rho, chance = spearmanr(x, y)
+    if len(x) >= FEW or np.isnan(rho):
+        return float(rho), float(chance)
     ranks, other = (rankdata(each) - (len(x) + 1) / 2 for each in (x, y))
 
     def together(values: Array, axis: int = -1) -> Array:
         return np.asarray(np.sum(values * other, axis=axis))
 
     tried = permutation_test((ranks,), together, permutation_type="pairings", vectorized=True, random_state=1)
-    return float(found), float(tried.pvalue)
+    return float(rho), float(tried.pvalue)
 
 
 def words(key: str) -> str:

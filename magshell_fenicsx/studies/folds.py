@@ -167,12 +167,12 @@ class KnownFolds:
         if held.keys() - {"pressure", "lambda_m"}:
             raise FoldLost("other amplitudes are driven before the pressure")
         nodes = chart(scene)
-        for known in sorted(self._known, key=lambda known: self._distance(values, known.values)):
-            order = matching(known.nodes, nodes) if known.nodes.shape == nodes.shape else None
+        for near in sorted(self._known, key=lambda near: self._distance(values, near.values)):
+            order = matching(near.nodes, nodes) if near.nodes.shape == nodes.shape else None
             if order is None:
                 continue
-            u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (known.u, known.phi))
-            return self.polished(values, scene, Guess(State(u, held | {"pressure": known.pressure}), phi), phi)
+            u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (near.u, near.phi))
+            return self.polished(values, scene, Guess(State(u, held | {"pressure": near.pressure}), phi), phi)
         raise FoldLost("no fold is known on this mesh")
 
     def _distance(self, a: Values, b: Values) -> float:
@@ -184,7 +184,7 @@ class KnownFolds:
                 continue
             if not isinstance(x, float | int) or not isinstance(y, float | int):
                 return np.inf
-            numbers = [v for known in self._known if isinstance(v := known.values.get(key), float | int)]
+            numbers = [v for located in self._known if isinstance(v := located.values.get(key), float | int)]
             total += ((x - y) / (float(np.std([*numbers, x])) or 1.0)) ** 2
         return total
 
@@ -207,9 +207,9 @@ class Scenes:
             If it cannot be meshed.
         """
         key = _apart_from_strength(case)
-        known = self._kept.pop(key, None)
-        if known:
-            scene = known.retuned(case.context)
+        earlier_scene = self._kept.pop(key, None)
+        if earlier_scene:
+            scene = earlier_scene.retuned(case.context)
         else:
             scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene

@@ -67,8 +67,8 @@ def of_others(file: Path, origin: Origin) -> bool:
 
 
 def _read(file: Path) -> Timings | None:
-    known = kept(file, TypeAdapter(Timings))
-    return known if known and all(sample.keys() >= set(TIMES) for sample in known.samples) else None
+    timings = kept(file, TypeAdapter(Timings))
+    return timings if timings and all(sample.keys() >= set(TIMES) for sample in timings.samples) else None
 
 
 def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:

@@ -277,11 +277,11 @@ def run_chain(chain: Chain, folds: Known) -> Iterator[tuple[int, Outcome]]:
 
 
 def _by_fold(
-    continuation: Continuation, link: Link, known: Known, start: float, *, same_mesh: bool
+    continuation: Continuation, link: Link, folds: Known, start: float, *, same_mesh: bool
 ) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = known.scenes.of(link.case)
+        scene = folds.scenes.of(link.case)
     except MeshError:
         return None, 0
     if same_mesh and not continuation.has_mesh_of(scene):
@@ -293,7 +293,7 @@ def _by_fold(
     except FoldLost:
         return None, factorisation.count - before
     result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
-    return outcome_of(result, "fold", work, time.perf_counter() - start, known.columns), work
+    return outcome_of(result, "fold", work, time.perf_counter() - start, folds.columns), work
 
 
 def _by_path(
@@ -410,9 +410,9 @@ def _write(
     first = (*swept, "k_d", *OF_LIMIT, "stopped", "found", "factorisations", "dofs", "wall_s", "point", "barrier")
     write_csv(rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE)
     lines = [{**point.values, **row} for point, outcome in done for row in outcome.curve]
-    there = [key for key in CURVE if any(key in line for line in lines)]
+    curves = [key for key in CURVE if any(key in line for line in lines)]
     own = [key for line in lines for key in line if key not in COLUMNS]
-    write_csv(lines, tuple(dict.fromkeys((*swept, *there, *own))), folder / CURVES)
+    write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *own))), folder / CURVES)
     draw_sweep(axes, points, outcomes, folder / PICTURE, (scalar.name, results) if scalar and results else None)
 
 

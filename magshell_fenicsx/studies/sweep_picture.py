@@ -82,14 +82,14 @@ def draw_sweep(
 
 def _fixed(axes: Sequence[Axis], points: Sequence[SweepPoint]) -> str:
     """R/h and Poisson's ratio, where all points have the same."""
-    found = []
+    parts = []
     for symbol, values in (
         ("$R/h$", {round(given(point.case.shell).R_over_h, 9) for point in points}),
         (r"$\nu$", {point.case.shell.poisson_ratio for point in points}),
     ):
         if len(values) == 1:
-            found.append(f"{symbol} = {next(iter(values)):.6g}")
-    return ", ".join(found)
+            parts.append(f"{symbol} = {next(iter(values)):.6g}")
+    return ", ".join(parts)
 
 
 def _is_map(axes: Sequence[Axis]) -> bool:

@@ -66,8 +66,8 @@ class Ellipsoid(Distance):
         tangent = np.eye(3) - n[:, :, None] * n[:, None, :]
         S = tangent @ (np.eye(3) / self.semi**2 / steep[:, None, None]) @ tangent  # the curvatures of the surface
         curvatures, directions = np.linalg.eigh(S)
-        there = curvatures / np.maximum(1 + g[:, None] * curvatures, FLAT)  # and of its parallel one
-        N = np.einsum("nia,na,nja->nij", directions, there, directions)
+        parallel = curvatures / np.maximum(1 + g[:, None] * curvatures, FLAT)  # and of its parallel one
+        N = np.einsum("nia,na,nja->nij", directions, parallel, directions)
         return g, n @ self.axes, np.einsum("ai,nab,bj->nij", self.axes, N, self.axes, optimize=True)
 
     def nearest(self, y: Array) -> Array:

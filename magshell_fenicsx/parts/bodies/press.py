@@ -66,8 +66,8 @@ class ContactSection(PathStep):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         bodies: Mapping[str, object] = context.sections["bodies"]
         if (self.body is None and len(bodies) != 1) or (self.body is not None and self.body not in bodies):
-            known = ", ".join(bodies) or "none: give it in bodies"
-            raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {known}")
+            allowed = ", ".join(bodies) or "none: give it in bodies"
+            raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {allowed}")
 
     @property
     def prescribed(self) -> Control:

@@ -45,10 +45,10 @@ def _or_formula(unit: str) -> Any:
     def read(value: Any) -> Any:
         if isinstance(value, str) and is_formula(value):
             return value
-        found = in_units(unit)(value)
-        if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= LARGEST:
+        number = in_units(unit)(value)
+        if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= LARGEST:
             raise ValueError(f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas")
-        return found
+        return number
 
     return BeforeValidator(read, json_schema_input_type=Finite | str)
 
@@ -242,8 +242,8 @@ class DeadSection(PathStep):
         from magshell_fenicsx.parts.forces.dead_load import dead_load  # the solver takes long to import
 
         mirror = modelled.mirror
-        here = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
-        made = (dead_load(load, f"{step.name}_potential_{i}", context, modelled) for i, load in enumerate(here))
+        loads = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
+        made = (dead_load(load, f"{step.name}_potential_{i}", context, modelled) for i, load in enumerate(loads))
         return {"dead": {step.name: tuple(made)}}
 
 
@@ -268,10 +268,10 @@ def is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: A
         other.potential is None,
     ):
         return False
-    for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
-        if (here is None) != (there is None):
+    for own, others in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
+        if (own is None) != (others is None):
             return False
-        if here and np.abs(mirror.reflection @ here - there).max() > 1e-10 * np.linalg.norm(here):
+        if own and np.abs(mirror.reflection @ own - others).max() > 1e-10 * np.linalg.norm(own):
             return False
     return True
 

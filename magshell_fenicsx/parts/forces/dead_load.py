@@ -292,9 +292,9 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
 
 def within(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
     """One in the cells of a patch, zero in the others."""
-    found = fem.Function(fem.functionspace(domain, ("DG", 0)))
-    found.x.array[found.function_space.dofmap.list[:, 0]] = patch
-    return found
+    indicator = fem.Function(fem.functionspace(domain, ("DG", 0)))
+    indicator.x.array[indicator.function_space.dofmap.list[:, 0]] = patch
+    return indicator
 
 
 class SurfaceMeasures:

@@ -63,9 +63,11 @@ class BodyMeasures:
         d = ufl.SpatialCoordinate(domain) - centre
         height, h = ufl.dot(d, normal), thickness_at(self._body, x)
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
-        here = ufl.conditional(ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0)  # and not through a closed shell
+        within = ufl.conditional(
+            ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0
+        )  # and not through a closed shell
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": SMOOTH})
-        return averaged(self._V, force, Weighted(here * smooth(d - height * normal, radius), dx), self._log)
+        return averaged(self._V, force, Weighted(within * smooth(d - height * normal, radius), dx), self._log)
 
     def _reach(self, x: Array, n: Array) -> float:
         """Distance from the normal line at x of the farthest node of the cells around it."""

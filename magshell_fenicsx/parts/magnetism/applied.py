@@ -92,8 +92,8 @@ class AppliedField:
         self._still = Follows(lambda: of(self.places), lambda: (r0.x.array, u.x.array))
         places = self._r0.renew()
         B, G, H = self._sum(of(places.reshape(-1, 3)), places.reshape(-1, 3))
-        known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
-        self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(places.shape)
+        differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
+        self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
         refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
         self.polynomial.follow(self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values()))
 
@@ -127,9 +127,9 @@ class AppliedField:
         values = np.zeros_like(self.polynomial.values)
         values[..., :3] = self.polynomial.values[..., :3] if moved else 0.0
         shape = values.shape[:2]
-        for here in self._here:
-            if name in here.driven.names and (not other or other in here.driven.names):
-                B, G = (here.twice(name, other), None) if other else here.by(name)
+        for curve in self._here:
+            if name in curve.driven.names and (not other or other in curve.driven.names):
+                B, G = (curve.twice(name, other), None) if other else curve.by(name)
                 values[..., 6:9] += B.reshape(*shape, 3)
                 if G is not None:
                     values[..., 9:18] += G.reshape(*shape, 9)
@@ -154,7 +154,7 @@ class AppliedField:
     def _sum(self, still: tuple[Array, Array, Array], x: Array) -> tuple[Array, Array, Array]:
         """B, G and H of the field that no amplitude drives and of those that are driven, at places."""
         self._here = [each.at(x, self.mu) for each in self._driven]
-        parts = [still, *(here.value for here in self._here)]
+        parts = [still, *(curve.value for curve in self._here)]
         B, G, H = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
         return B, G, H
 
@@ -201,8 +201,8 @@ class Amplitude:
         """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its own."""
         if not isinstance(q, Amplitude):
             if hasattr(q, "bends"):
-                found: Sequence[Derivative] = q.bends(self)
-                return found
+                derivatives: Sequence[Derivative] = q.bends(self)
+                return derivatives
             entered = [t for t in self.slopes() if q in t.form.constants()]
             return [self._term(t, derived(t.form, q)) for t in entered]
         if q.known is not self.known:
@@ -238,13 +238,13 @@ def field_parameters(
     fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
 ) -> dict[str, Parameter]:
     """The amplitudes of driven fields, by name; collective."""
-    found = {}
-    for known in fields:
-        own = [t for t in terms if isinstance(t, FormTerm) and known.polynomial in t.form.coefficients()]
-        for name in known.names:
-            p = Amplitude(known, name, own, u, log)
+    parameters = {}
+    for field in fields:
+        own = [t for t in terms if isinstance(t, FormTerm) and field.polynomial in t.form.coefficients()]
+        for name in field.names:
+            p = Amplitude(field, name, own, u, log)
             slopes = p.slopes()
             for each in slopes:
                 each.compile_residual()
-            found[name] = Parameter(p, slopes, p.bends)
-    return found
+            parameters[name] = Parameter(p, slopes, p.bends)
+    return parameters

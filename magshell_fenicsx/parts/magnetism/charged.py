@@ -67,9 +67,9 @@ class Shape:
     def thickness(self, cells: Ints, X: Array) -> Array:
         """The thickness over R and its derivatives by X (.., n, m) at places (n, m, d) of reference cells."""
         if self.thick is None:
-            found = np.zeros((3, *X.shape[:2]))
-            found[0] = self.h
-            return found
+            thickness = np.zeros((3, *X.shape[:2]))
+            thickness[0] = self.h
+            return thickness
         element, values = self.thick
         return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 

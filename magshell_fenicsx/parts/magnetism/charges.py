@@ -276,12 +276,12 @@ def field(families: Sequence[Family], places: Array) -> Array:
     TooNear
         If one is in the shell's surface.
     """
-    found = np.zeros_like(places)
+    B = np.zeros_like(places)
     for at, of, _ in _seen(families, places, None):
         d = places[of][:, None, None] - at.x
         r = np.linalg.norm(d, axis=-1)
-        np.add.at(found, of, np.sum((at.q / r**3)[..., None] * d, axis=(1, 2)) / (4 * np.pi))
-    return found
+        np.add.at(B, of, np.sum((at.q / r**3)[..., None] * d, axis=(1, 2)) / (4 * np.pi))
+    return B
 
 
 def gradient(families: Sequence[Family], place: Array, e: Array, into: Nodal) -> float:
@@ -347,7 +347,7 @@ def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
         np.full((family.count * count, 2), 1 / parts),
     )
     corners, (rule, weights) = np.clip(AROUND, TINY, 1 - TINY), square(3)
-    found = []
+    flat = []
     for part in _chunks(boxes, len(weights)):
         x = family.at(part, corners, np.zeros(len(corners))).x
         q = family.at(part, rule, weights).q.sum(axis=1).ravel()
@@ -356,5 +356,5 @@ def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
         area = np.linalg.norm(np.cross(both[:, :, 1] - both[:, :, 0], both[:, :, 2] - both[:, :, 0]), axis=-1)
         share = area / area.sum(axis=1, keepdims=True)
         kept = (share > SMALL).ravel()
-        found.append((both.reshape(-1, 3, 3)[kept], (share * q[:, None]).ravel()[kept]))
-    return found
+        flat.append((both.reshape(-1, 3, 3)[kept], (share * q[:, None]).ravel()[kept]))
+    return flat

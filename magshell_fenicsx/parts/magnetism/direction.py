@@ -18,10 +18,10 @@ FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
 
 def directions(programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float) -> Array:
     """Unit vectors (steps + 1, 3) of the field before each step and after the last, in a turned frame."""
-    found = [field.axes[0] if field else np.eye(3)[2]]
+    vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
-        found.append(step.load.to.vector(turn) if isinstance(step.load, RotationSection) else found[-1])
-    return np.array(found)
+        vectors.append(step.load.to.vector(turn) if isinstance(step.load, RotationSection) else vectors[-1])
+    return np.array(vectors)
 
 
 def components(direction: Array, field: Magnetisation | None) -> Array:

@@ -144,8 +144,8 @@ class RotationSection(Step):
 
         all_directions = directions(context.steps, loads.magnetic, turn)
         first, before, after = (all_directions[i] for i in (0, step.number - 1, step.number))
-        there = degrees(acos(float(np.clip(after @ first, -1, 1))))
-        return Ahead("its last direction", there if before @ first > 1 - SAME else None)
+        angle = degrees(acos(float(np.clip(after @ first, -1, 1))))
+        return Ahead("its last direction", angle if before @ first > 1 - SAME else None)
 
 
 def turn_name(step: ProgrammeStep) -> str:

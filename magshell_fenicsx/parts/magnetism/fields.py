@@ -178,7 +178,7 @@ class MagneticSection(Section, Ability):
             "remanence: rotation": self.remanence == "rotation",
             f"energy: {self.energy}": self.energy != "full",
         }
-        if bad := next((key for key, there in beside.items() if there), None):
+        if bad := next((key for key, given in beside.items() if given), None):
             raise ValueError(
                 f"interaction: {self.interaction}: not with {bad}: it is that of parts with a remanence alone, with "
                 "remanence: deformation and energy: full"

@@ -67,10 +67,10 @@ def magnetisation(
         Directions that the field turns to.
     """
     section, gradient = magnetic.remanent or RemanentSection.model_construct(), magnetic.applied.gradient
-    known, driven = in_space(context, turn)
+    field, driven = in_space(context, turn)
     own = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
-    for direction in () if known else to:
+    for direction in () if field else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
         if np.linalg.norm(away) > SAME:
             basis.append(away / np.linalg.norm(away))
@@ -81,7 +81,7 @@ def magnetisation(
     remanent = _remanence(section, context, turn, within) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    G = Q @ np.array(gradient) @ Q.T if gradient and not known else None
+    G = Q @ np.array(gradient) @ Q.T if gradient and not field else None
     return Magnetisation(
         remanent,
         applied,
@@ -91,7 +91,7 @@ def magnetisation(
         patches,
         layers,
         magnetic.remanence,
-        known,
+        field,
         tuple(basis),
         driven,
         turns(context, turn),
@@ -137,8 +137,8 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = context.of(MagneticSection)
     assert magnetic
-    known = magnetic.applied.components if magnetic.applied.beside else None
-    alone = known or not magnetic.applied.beside or not strength(context)
+    formulas = magnetic.applied.components if magnetic.applied.beside else None
+    alone = formulas or not magnetic.applied.beside or not strength(context)
     magnetised = magnetic.remanent.directions() if magnetic.remanent else []
     vectors = [d.vector() for d in (*magnetised, *([] if alone else [magnetic.applied]))]
     whole = turns(context)  # then the rotation is a part of the field at each place
@@ -148,7 +148,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     if isinstance(remanent.components, GivenField):
         return [Leaves("the remanence is a function on a mesh", mirrors=nothing)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
-    fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
+    fields += [vectors_of(texts) for texts in (remanent.components, formulas) if texts]
     askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
     if remanent.file:
         by_place = by_points(remanent)
@@ -156,7 +156,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
     if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
         askew.append("the formula of the remanence differs around e3")
-    if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
+    if formulas and not (outline.span and vector_turns(formulas, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
     if isinstance(magnetic.susceptibility, str) and not (
         outline.span and scalar_turns(magnetic.susceptibility, outline.span)
@@ -170,7 +170,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
 
     def mirrors(mirror: Mirror) -> bool:
         S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
-        x = beside(x) if known else x
+        x = beside(x) if formulas else x
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))

@@ -148,33 +148,33 @@ class Near:
 
     def _at_boundary(self) -> NDArray[np.bool_]:
         """(cells, 3) sides that no other cell has."""
-        found = np.ones((len(self._corners), 3), dtype=bool)
+        at_boundary = np.ones((len(self._corners), 3), dtype=bool)
         for c, others in enumerate(self.touching):
             for d in others:
                 for edge in range(3):
                     if c != d and self._shared(c, edge, d):
-                        found[c, edge] = False
-        return found
+                        at_boundary[c, edge] = False
+        return at_boundary
 
     def _shared(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
         """The local number in d of a side of c, and whether it runs the other way."""
         a, b = (int(self._corners[c, i]) for i in ENDS[edge])
-        for there, (i, j) in enumerate(ENDS):
+        for side, (i, j) in enumerate(ENDS):
             ends = int(self._corners[d, i]), int(self._corners[d, j])
             if ends in ((a, b), (b, a)):
-                return there, ends == (b, a)
+                return side, ends == (b, a)
         return None
 
     def _kinds(self, c: int, d: int) -> Iterator[Kind]:
         """Of all elements of two cells that touch."""
         mine, theirs = ([int(each) for each in self._corners[cell]] for cell in (c, d))
         mask = tuple(map(bool, self._free[c]))
-        sides = [(e, found) for e in range(3) if c != d and (found := self._shared(c, e, d))]
+        sides = [(e, shared) for e in range(3) if c != d and (shared := self._shared(c, e, d))]
         if c == d:
             yield "faces", mask, "self"
         elif sides:
-            e, (there, flip) = sides[0]
-            yield "faces", mask, "side", e, there, flip
+            e, (side_of_other, flip) = sides[0]
+            yield "faces", mask, "side", e, side_of_other, flip
         else:
             yield "faces", mask, "corner", next(i for i, each in enumerate(theirs) if each in mine)
         for e in np.flatnonzero(self._strips[c]):
@@ -244,8 +244,8 @@ class Near:
             at = 1 - t if kind[4] else t
             if kind[2] == "end":  # as far from the common end as the place is, beyond it
                 at = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
-            found = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
-            return first, Places.of_strip(kind[3], *(np.concatenate(each) for each in zip(*found, strict=True))), False
+            strips = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
+            return first, Places.of_strip(kind[3], *(np.concatenate(each) for each in zip(*strips, strict=True))), False
         return first, Places.of_strip(kind[3], t, eta, w), True
 
     def _each(self, rules: list[tuple[Array, Array]]) -> Places:

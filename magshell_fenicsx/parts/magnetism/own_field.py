@@ -48,18 +48,18 @@ class OwnField:
     """
 
     def __init__(self, sight: Sight) -> None:
-        found = magnetised(sight.loads)
-        assert found
-        self._sight, self._model, self.magnetised = sight, sight.model, found
+        of = magnetised(sight.loads)
+        assert of
+        self._sight, self._model, self.magnetised = sight, sight.model, of
         V = sight.model.r0.function_space
         topology = V.mesh.topology
         self._dim = topology.dim
         self._owned = topology.index_map(self._dim).size_local
-        pattern = found.remanent if callable(found.remanent) else Uniform(np.asarray(found.remanent))
+        pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
         self.Br = pattern_field(pattern, sight.model.r0)[0]
         self._thickness = sight.model.thickness
         self._thins = sight.model.material.law.thins
-        self._plain = found.law == "deformation" and found.soft is None
+        self._plain = of.law == "deformation" and of.soft is None
         if not self._plain:
             carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
             self._at = carrier.discontinuous(3).element.basix_element
@@ -79,13 +79,13 @@ class OwnField:
             images = [image.back(x) for image in self._images]
             if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
                 raise TooNear
-            found = np.zeros(3)
+            total = np.zeros(3)
             for image in self._images:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
-                found = found + sign * image.Q @ field(families, image.back(x)[None])[0]
+                total = total + sign * image.Q @ field(families, image.back(x)[None])[0]
         except TooNear:
-            found = np.full(3, np.nan)
-        return np.asarray(self._model.system.comm.allreduce(found))
+            total = np.full(3, np.nan)
+        return np.asarray(self._model.system.comm.allreduce(total))
 
     def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
         """The derivatives of e . B at this rank's nodes, by the displacement and by the remanence."""
@@ -102,10 +102,10 @@ class OwnField:
 
     def moment(self, families: Sequence[Family], mu: Mapping[str, float]) -> Array:
         """The integral of the remanence as the shell carries it over its volume, (3,) over R³; collective."""
-        found = np.asarray(self._model.system.comm.allreduce(moment(families)))
+        total = np.asarray(self._model.system.comm.allreduce(moment(families)))
         if mirror := self._sight.mirror:
-            found = mirror.summed(found, self.sign_of_images(mu))
-        return found
+            total = mirror.summed(total, self.sign_of_images(mu))
+        return total
 
     @property
     def _images(self) -> list[Image]:
@@ -138,11 +138,11 @@ class OwnField:
         """(3, cells, nodes, 3) of a field at the nodes of what is taken back to the undeformed shell."""
         V = self._model.r0.function_space
         T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
-        found = np.einsum("dmk,nki->dnmi", T, nodal)
+        jets = np.einsum("dmk,nki->dnmi", T, nodal)
         if self._dim == 2:
-            return np.asarray(found)
-        zero = np.zeros(found.shape[1:3])
-        parts = [(f[..., 0], zero, f[..., 1]) for f in found] + [(zero, found[0][..., 0], zero)]
+            return np.asarray(jets)
+        zero = np.zeros(jets.shape[1:3])
+        parts = [(f[..., 0], zero, f[..., 1]) for f in jets] + [(zero, jets[0][..., 0], zero)]
         return np.stack([np.stack(part, axis=-1) for part in parts])
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
@@ -187,14 +187,14 @@ class OwnField:
         by_u = into.by_u + np.einsum("dmk,dnmi->nki", T, on)
         Q = self.Br.function_space
         TB = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
-        known, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal())
+        Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal())
         for i in range(3):
-            self.Br.x.array[:] = known
+            self.Br.x.array[:] = Br
             zero = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1)
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
             change = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1) - zero
             by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
-        self.Br.x.array[:] = known
+        self.Br.x.array[:] = Br
         return Nodal(by_u, by_B)
 
     def _sides(self, *, every: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -224,18 +224,18 @@ class OwnField:
                     edges.append(local)
                     continue
                 other = next(int(c) for c in to_cells.links(facet) if c != cell)
-                there = int(np.flatnonzero(at[other] == facet)[0])
-                if every or not self._plain or np.abs(ends[cell, local] - ends[other, there]).max() > JUMP * largest:
+                its_edge = int(np.flatnonzero(at[other] == facet)[0])
+                if every or not self._plain or np.abs(ends[cell, local] - ends[other, its_edge]).max() > JUMP * largest:
                     cells.append(cell)
                     edges.append(local)
-        found = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
+        sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
         if dim == 2:
-            return found
+            return sides
         X = np.array([[0.0], [1.0]])  # a pole has no edge: local facets of an interval are its ends
         T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
         rho = np.einsum("mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0])
-        off = np.abs(rho[found]) > AXIS
-        return found[0][off], found[1][off]
+        off = np.abs(rho[sides]) > AXIS
+        return sides[0][off], sides[1][off]
 
     def _ends(self, count: int, values: Array) -> Array:
         """The remanence in the middle of each local edge, (cells, edges, 3)."""
@@ -264,10 +264,10 @@ class OwnField:
 def own_field(sight: Sight) -> OwnField:
     """That of a model, which keeps it until another remanence takes the place of its own."""
     model, of = sight.model, magnetised(sight.loads)
-    known = model.kept.get(OwnField)
-    if known is None or known.magnetised is not of:
-        known = model.kept[OwnField] = OwnField(sight)
-    return known
+    own = model.kept.get(OwnField)
+    if own is None or own.magnetised is not of:
+        own = model.kept[OwnField] = OwnField(sight)
+    return own
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
@@ -293,16 +293,16 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
 
     def present() -> list[tuple[Array, Array]]:
         _, families = own.families(state.mu)
-        found = [each for family in families for each in triangles(family, parts)]
+        all_charged = [each for family in families for each in triangles(family, parts)]
         if mirror:
             sign = own.sign_of_images(state.mu)
             copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
-            found = [(image.of(x), factor * q) for image, factor in copies for x, q in found]
-        return found
+            all_charged = [(image.of(x), factor * q) for image, factor in copies for x, q in all_charged]
+        return all_charged
 
     system = sight.model.system
-    found = [each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank]
-    corners, charges = (np.concatenate([each[i] for each in found]) for i in range(2))
+    all_charged = [each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank]
+    corners, charges = (np.concatenate([each[i] for each in all_charged]) for i in range(2))
     corners = R * corners @ Q
     m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     J = (of.tesla * R**2 * charges / np.sum(m * m, axis=-1))[:, None] * m

@@ -119,19 +119,19 @@ class SensorsSeen(Seen):
         if of is None or not sight.loads.sensors:
             return {}
         own, at = own_field(sight), sight.model.system.at(state)
-        found = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
+        moment = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
         size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
-        return {"magnetic_moment": {"value": (size * found).tolist(), "unit": "A m²" if of.metres else "|Br| R³/μ0"}}
+        return {"magnetic_moment": {"value": (size * moment).tolist(), "unit": "A m²" if of.metres else "|Br| R³/μ0"}}
 
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
         from magshell_fenicsx.parts.magnetism.own_field import CENTRAL, STEP, own_field
 
-        found = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]
-        if not found:
+        matching = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]
+        if not matching:
             return None
-        (sensor, i), own = found[0], own_field(sight)
+        (sensor, i), own = matching[0], own_field(sight)
         e = sensor.own * rotation(sight.azimuth)[:, i]
         system = sight.model.system
         at, nodes = system.at(state), sight.model.r0.function_space.dofmap.list
@@ -150,7 +150,7 @@ class SensorsSeen(Seen):
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
                 size = STEP * (abs(value) or 1.0)
                 moved = ((way, State(state.u, {**state.mu, name: value + way * size})) for way, _ in CENTRAL)
-                values = {way: self._readings(sight, there, [sensor])[0][i] for way, there in moved}
+                values = {way: self._readings(sight, moved_state, [sensor])[0][i] for way, moved_state in moved}
                 by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
         value = float(self._readings(sight, state, [sensor])[0][i])
         return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
@@ -168,10 +168,10 @@ class SensorsSeen(Seen):
             _, families = own.families(state.mu)
             return [each.own * own.B(families, state.mu, each.place) for each in of]
 
-        found, applied = sight.model.system.at(state).of(present), sight.loads.magnetic
+        fields, applied = sight.model.system.at(state).of(present), sight.loads.magnetic
         if applied:
-            found = [
+            fields = [
                 B + each.applied * applied.at(state.mu, each.place[None])[0] if each.total else B
-                for each, B in zip(of, found, strict=True)
+                for each, B in zip(of, fields, strict=True)
             ]
-        return [B @ Q for B in found]
+        return [B @ Q for B in fields]

@@ -129,8 +129,8 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
     chart, half = np.asarray(drawn.inverse(x), dtype=float), 0.5 / shell.R_over_h
     for _ in range(STEPS):
         steps = np.vstack([chart, *(chart + DIFFERENCE * e for e in np.eye(len(chart)))])
-        here, *there = drawn.embedding(steps)
-        change = np.linalg.lstsq(np.array([each - here for each in there]).T / DIFFERENCE, x - here, rcond=None)[0]
+        foot, *there = drawn.embedding(steps)
+        change = np.linalg.lstsq(np.array([each - foot for each in there]).T / DIFFERENCE, x - foot, rcond=None)[0]
         again = np.asarray(drawn.inverse(drawn.embedding((chart + change)[None])[0]), dtype=float)
         if not np.isfinite(again).all():
             break

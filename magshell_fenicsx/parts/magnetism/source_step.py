@@ -121,14 +121,14 @@ class SourceStep(PathStep):
 
 def source_columns(loads: "Loads") -> dict[str, str]:
     """Amplitude of a source -> the column of the force, the torque or the work on it."""
-    found: dict[str, str] = {}
+    kinds_of: dict[str, str] = {}
     turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
     for each in loads.magnetic.driven if loads.magnetic else ():
         own = [motion for motion in each.motions if motion.name not in turns]
-        found |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
-        found |= dict.fromkeys(each.factors, "source_work")
-    kinds = list(found.values())
-    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in found.items()}
+        kinds_of |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
+        kinds_of |= dict.fromkeys(each.factors, "source_work")
+    kinds = list(kinds_of.values())
+    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in kinds_of.items()}
 
 
 def source_size(loads: "Loads", name: str) -> float:

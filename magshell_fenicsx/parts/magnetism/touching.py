@@ -122,10 +122,10 @@ def beyond(X: Array, sides: tuple[int, int], flip: bool) -> Array:
     """Where points of a triangle are in the plane of the next one, behind the side that both have."""
     bary, (i, j), (m, n) = barycentric(X), ENDS[sides[0]], ENDS[sides[1]]
     m, n = (n, m) if flip else (m, n)
-    found = np.zeros_like(bary)
+    beyond_side = np.zeros_like(bary)
     rest = bary[:, 3 - i - j]
-    found[:, m], found[:, n], found[:, 3 - m - n] = bary[:, i] + rest, bary[:, j] + rest, -rest
-    return np.asarray(found[:, 1:])
+    beyond_side[:, m], beyond_side[:, n], beyond_side[:, 3 - m - n] = bary[:, i] + rest, bary[:, j] + rest, -rest
+    return np.asarray(beyond_side[:, 1:])
 
 
 def strip() -> tuple[Array, Array, Array]:
@@ -143,7 +143,7 @@ def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
     beyond_it = not 0 <= t <= 1  # where normals may differ, so that no points come too near each other
     power, least = (1, 0.1) if beyond_it else (3, 0.02)
     ways = [(0.0, t, -1.0), (0.0, 1 - t, 1.0)] if not beyond_it else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
-    found = list[tuple[Array, Array, Array]]()
+    pieces = list[tuple[Array, Array, Array]]()
     for high in (-eta, 1 - eta):
         for e, we in zip(eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True):
             scale = s * max(abs(e - eta), least)
@@ -151,5 +151,5 @@ def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
                 bottom, top = np.arcsinh(near / scale), np.arcsinh(far / scale)
                 r = bottom + (top - bottom) * v
                 along = t + way * scale * np.sinh(r)
-                found.append((along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r)))
-    return tuple(np.concatenate(each) for each in zip(*found, strict=True))
+                pieces.append((along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r)))
+    return tuple(np.concatenate(each) for each in zip(*pieces, strict=True))

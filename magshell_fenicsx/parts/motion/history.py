@@ -131,17 +131,17 @@ def curve(history: History, time: Value, level: Value, here: float) -> Curve:
 
 def marks(history: History, time: Value, end: float) -> list[float]:
     """Times within (0, end) at which it jumps or has a kink."""
-    found: list[float] = []
+    times: list[float] = []
     if isinstance(history, RampHistory):
-        found = [time(history.over)]
+        times = [time(history.over)]
     elif isinstance(history, StepHistory):
-        found = [time(history.at)]
+        times = [time(history.at)]
     elif isinstance(history, WaveHistory) and history.kind == "triangle":
         quarter = time(history.period) / 4
-        found = [quarter * i for i in range(1, int(end / quarter) + 1, 2)]
+        times = [quarter * i for i in range(1, int(end / quarter) + 1, 2)]
     elif isinstance(history, list):
-        found = [time(t) for t, _ in history]
-    return [t for t in found if 0 < t < end]
+        times = [time(t) for t, _ in history]
+    return [t for t in times if 0 < t < end]
 
 
 def times_of(history: History) -> list[float | str]:

@@ -36,10 +36,10 @@ def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natu
         if isinstance(value, GivenField):
             return value.mapped(lambda numbers: factor * _completed(numbers, stretch=whole is _stretches))
         if not isinstance(value, dict):
-            found = whole(value)
-            if any(isinstance(v, str) for v in found):
-                return ByFormula([function(v) for v in found], Q, R, factor)
-            return factor * np.array(found, dtype=float)
+            parts = whole(value)
+            if any(isinstance(v, str) for v in parts):
+                return ByFormula([function(v) for v in parts], Q, R, factor)
+            return factor * np.array(parts, dtype=float)
         vectors = {name: factor * np.array(whole(each), dtype=float) for name, each in value.items()}
         if isinstance(context.shell, MeshSurface):
             return vectors
@@ -101,9 +101,9 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     x, R, direction = outline.sample(), context.shell.reference, along(context)
 
     def alike(text: float | str, sign: float = 1.0) -> bool:
-        here, there = (function(text)(*(R * places).T) for places in (x, mirror.image(x)))
-        size = np.abs(here).max(initial=0.0)
-        return bool(np.isfinite(here).all() and (np.abs(here - sign * there) <= SAME * size).all())
+        own, of_image = (function(text)(*(R * places).T) for places in (x, mirror.image(x)))
+        size = np.abs(own).max(initial=0.0)
+        return bool(np.isfinite(own).all() and (np.abs(own - sign * of_image) <= SAME * size).all())
 
     twists = [c[2] for c in _each(section.curvature) if len(c) == 3]
     even = [v for c in (*_each(section.curvature), *_each(section.stretch)) for v in c[:2]]
@@ -122,15 +122,15 @@ def _each(value: object) -> list[list[float | str]]:
 
 
 def _curvatures(value: object) -> list[float | str]:
-    found = components(value)
-    return found if len(found) == 3 else [*found, *found, 0.0]
+    values = components(value)
+    return values if len(values) == 3 else [*values, *values, 0.0]
 
 
 def _stretches(value: object) -> list[float | str]:
     """Less one; of one number the thickness grows too."""
-    found = components(value)
-    less = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in found]
-    return [*less, 0.0] if len(found) == 2 else less * 3
+    values = components(value)
+    less = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in values]
+    return [*less, 0.0] if len(values) == 2 else less * 3
 
 
 def _completed(numbers: Array, *, stretch: bool) -> Array:

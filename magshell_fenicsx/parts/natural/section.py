@@ -30,11 +30,11 @@ PLACE = ("x", "y", "z", "pi")
 
 def per_length(value: Any) -> Any:
     """Text such as "5/m" or "5 m^-1" as a number in 1/m; all else, formulas too, as it is."""
-    found = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
-    unit = found and (found["below"] or found["power"])
-    if not found or unit in PLACE:
+    matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
+    unit = matched and (matched["below"] or matched["power"])
+    if not matched or unit in PLACE:
         return value
-    return in_units("1/metre")(f"{found['number']} {unit}**-1")
+    return in_units("1/metre")(f"{matched['number']} {unit}**-1")
 
 
 def _components(numbers: int, least: float, most: float, *, lengths: bool = False) -> BeforeValidator:

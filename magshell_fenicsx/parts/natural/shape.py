@@ -195,11 +195,11 @@ class Shape:
     stretch: fem.Constant | None
 
     @classmethod
-    def of(cls, field: fem.Function, natural: Natural, known: Constants) -> "Shape":
+    def of(cls, field: fem.Function, natural: Natural, shared: Constants) -> "Shape":
         """With amplitudes that all terms of a model share, kept in `known`."""
         domain = field.function_space.mesh
-        found = {name: known.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes}
-        return cls(field, found.get(CURVATURE), found.get(STRETCH))
+        amplitudes = {name: shared.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes}
+        return cls(field, amplitudes.get(CURVATURE), amplitudes.get(STRETCH))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -293,10 +293,10 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
         return np.asarray(a[..., :, None] * b[..., None, :])
 
     first, second = components[..., 0, None, None], components[..., 1, None, None]
-    found = second * np.eye(3) + (first - second) * product(t1, t1)
+    tensor = second * np.eye(3) + (first - second) * product(t1, t1)
     if components.shape[-1] == 3:
-        found = found + components[..., 2, None, None] * (product(t1, t2) + product(t2, t1))
-    return np.asarray(found)
+        tensor = tensor + components[..., 2, None, None] * (product(t1, t2) + product(t2, t1))
+    return np.asarray(tensor)
 
 
 def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[str, fem.Constant]) -> Shape:

@@ -80,11 +80,11 @@ def openings(
 
     def places(name: str) -> Array:
         dofs = fem.locate_dofs_topological(V, dim, edges[name])
-        here = r0.x.array.reshape(-1, 3)[dofs if nodes is None else dofs[nodes[dofs]]]
-        return np.concatenate(comm.allgather(here))
+        by_rank = r0.x.array.reshape(-1, 3)[dofs if nodes is None else dofs[nodes[dofs]]]
+        return np.concatenate(comm.allgather(by_rank))
 
-    here = comm.allgather(moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions))
-    names = [name for name in edges if any(name in rank for rank in here)]
+    by_rank = comm.allgather(moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions))
+    names = [name for name in edges if any(name in rank for rank in by_rank)]
     return names, without_potential(names, conditions, places)
 
 
@@ -97,10 +97,10 @@ def on_cells(sides: Mapping[str, float], midsurface: Midsurface) -> fem.Function
         Patch -> 1 from outside, -1 from inside.
     """
     Q = fem.functionspace(midsurface.mesh, ("DG", 0, (1,)))
-    found = fem.Function(Q, name="pressed")
+    pressed = fem.Function(Q, name="pressed")
     for name, side in sides.items():
-        found.x.array[Q.dofmap.list[midsurface.patches[name]].ravel()] = side
-    return found
+        pressed.x.array[Q.dofmap.list[midsurface.patches[name]].ravel()] = side
+    return pressed
 
 
 def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dict[str, NDArray[np.int32]]:

@@ -167,9 +167,9 @@ def sideways(load: EdgeSection) -> str | None:
 
 def held_vectors(load: EdgeSection) -> list[Array]:
     """Unit vectors (3,) that a mirror plane through e3 must hold: translations, and normals of axes of rotation."""
-    found = [np.array(one.translation) for one in load.moves if one.translation]
-    found += [np.cross([0.0, 0.0, 1.0], one.rotation.axis) for one in load.moves if one.rotation]
-    return [v / np.linalg.norm(v) for v in found if v.any()]
+    vectors = [np.array(one.translation) for one in load.moves if one.translation]
+    vectors += [np.cross([0.0, 0.0, 1.0], one.rotation.axis) for one in load.moves if one.rotation]
+    return [v / np.linalg.norm(v) for v in vectors if v.any()]
 
 
 def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:

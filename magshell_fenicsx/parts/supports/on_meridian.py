@@ -79,25 +79,25 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     MeshError
         If an end lies in no plane of symmetry.
     """
-    horizontal, axial, mirror = found = [list[Facets]() for _ in range(3)]
+    horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
     named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
-        here = meridian.ends.get(name, meridian.axis)
+        end = meridian.ends.get(name, meridian.axis)
         held = set(condition.components) if isinstance(condition, Held) else set()
         if condition in ("clamped", "simply supported"):
             held = {*HORIZONTAL, AXIAL}
         if condition == "plane":
             _refuse_slanting(meridian, name)
-            mirror.append(here)
+            mirror.append(end)
             held = {AXIAL}
         if held >= HORIZONTAL:
-            horizontal.append(here)
+            horizontal.append(end)
         if AXIAL in held:
-            axial.append(here)
+            axial.append(end)
         both = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if held >= part)
         if both:
-            named[name] = here, both
-    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found]
+            named[name] = end, both
+    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
     return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
 
 

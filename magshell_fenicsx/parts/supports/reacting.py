@@ -112,11 +112,11 @@ def observed_reactions(
     """
     from magshell_fenicsx.parts.supports.reactions import reactions  # the solver takes long to import
 
-    found: dict[str, float] = {}
+    by_column: dict[str, float] = {}
     for name, one in reactions(model, state, mirror).items():
         values = np.concatenate([force * one.force @ frame, force * length * one.moment @ frame])
-        found |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
-    return found
+        by_column |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
+    return by_column
 
 
 def account(context: Context, loads: "Loads") -> Account:

@@ -58,7 +58,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     R, taken = system.forces(state.u, state.mu), np.zeros(system.size, dtype=bool)
     axes = system.u.function_space.dofmap.index_map_bs
     r = in_space(model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes)
-    found: dict[str, Reaction] = {}
+    by_support: dict[str, Reaction] = {}
     for name, support in model.supports.items():
         dofs = support.dofs[support.dofs < system.size]
         box = _box(r[np.unique(dofs // axes)], mirror if mirror and mirror.other(name) == name else None, comm)
@@ -72,8 +72,8 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
         if axes == 2:  # around the axis
             force, moment, point = force * [0.0, 0.0, 1.0], 0 * moment, point * [0.0, 0.0, 1.0]
-        found[name] = Reaction(force, moment, point)
-    return _of_whole(found, mirror) if mirror else found
+        by_support[name] = Reaction(force, moment, point)
+    return _of_whole(by_support, mirror) if mirror else by_support
 
 
 def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
@@ -81,7 +81,7 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
 
     As in `reactions`, of the whole shell, and a node of two supports belongs to the first.
     """
-    system, found = model.system, np.zeros(model.system.size)
+    system, weights = model.system, np.zeros(model.system.size)
     if mirror and name in mirror.lost:
         name, way = mirror.lost[name], mirror.reflection @ way
     elif mirror and mirror.other(name) == name:
@@ -92,22 +92,22 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
         if other == name:
             axes = system.u.function_space.dofmap.index_map_bs
             along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
-            found[dofs] = np.where(taken[dofs], 0.0, along[dofs % axes])
-            return found
+            weights[dofs] = np.where(taken[dofs], 0.0, along[dofs % axes])
+            return weights
         taken[dofs] = True
     raise KeyError(name)
 
 
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
     """The reactions of the whole shell from those of a half."""
-    found, S = dict(half), mirror.reflection
+    whole, S = dict(half), mirror.reflection
     for lost, kept in mirror.lost.items():
         if kept in half:
-            found[lost] = half[kept].image(S, mirror.image(half[kept].point))
+            whole[lost] = half[kept].image(S, mirror.image(half[kept].point))
     for name, one in half.items():
         if mirror.other(name) == name:
-            found[name] = one.whole(mirror)
-    return found
+            whole[name] = one.whole(mirror)
+    return whole
 
 
 def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:

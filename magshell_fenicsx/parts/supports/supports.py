@@ -41,11 +41,11 @@ def held_on(
 ) -> list[fem.DirichletBC]:
     """Those components are zero on entities of some dimension, or at some of the `nodes` there alone."""
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
-    found = []
+    conditions = []
     for space in (V.sub(i) for i in axes):
         dofs = fem.locate_dofs_topological(space, dim, entities)
-        found.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space))
-    return found
+        conditions.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space))
+    return conditions
 
 
 def held_at_vertex(
@@ -76,17 +76,17 @@ def refuse_unknown(
         allowed |= set(points) - {"pole"} if isinstance(condition, Held) else set()
         allowed |= set(patches) if isinstance(condition, Held) or condition == "clamped" else set()
         if name not in allowed:
-            there = ", ".join(sorted(allowed)) or "none"
-            raise MeshError(f"boundary.{name}: the surface has no such edge, only {there}")
+            allowed_names = ", ".join(sorted(allowed)) or "none"
+            raise MeshError(f"boundary.{name}: the surface has no such edge, only {allowed_names}")
     for load in loads.all_dead:
         edge = getattr(load, "edge", None)
         if edge is not None and edge not in edges:
-            there = ", ".join(sorted(edges)) or "none"
-            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {there}")
+            allowed_names = ", ".join(sorted(edges)) or "none"
+            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
     for term in loads.own:
         if term.on is not None and term.on not in edges:
-            there, key = ", ".join(sorted(edges)) or "none", term.key or f"terms: {term.name}: on"
-            raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {there}")
+            allowed_names, key = ", ".join(sorted(edges)) or "none", term.key or f"terms: {term.name}: on"
+            raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {allowed_names}")
 
 
 def no_mirror(name: str) -> str:
@@ -157,7 +157,7 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
     topology = V.mesh.topology
     for dims in ((1, 2), (2, 1)):
         topology.create_connectivity(*dims)
-    corners, found = basix.geometry(basix.CellType.triangle), []
+    corners, conormals = basix.geometry(basix.CellType.triangle), []
     for facet in facets[facets < topology.index_map(1).size_local]:
         cell = topology.connectivity(1, 2).links(facet)[0]
         side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
@@ -166,8 +166,8 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
         a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
         along, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
         outward -= (outward @ along) / (along @ along) * along
-        found.append(np.linalg.norm(along) * outward / np.linalg.norm(outward))
-    return np.concatenate(V.mesh.comm.allgather(np.reshape(found, (-1, 3))))
+        conormals.append(np.linalg.norm(along) * outward / np.linalg.norm(outward))
+    return np.concatenate(V.mesh.comm.allgather(np.reshape(conormals, (-1, 3))))
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:
@@ -251,13 +251,13 @@ def supports(
             on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL))
             continue
         if name in body.faces:
-            here = held_on(V, 2, body.faces[name], components, nodes)
+            conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
         elif name in body.patches:
-            here = held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
+            conditions_of_part = held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
         else:
-            here = held_at_vertex(V, body.points[name], components)
-        held += here
-        named[name] = Support.of(here)
+            conditions_of_part = held_at_vertex(V, body.points[name], components)
+        held += conditions_of_part
+        named[name] = Support.of(conditions_of_part)
     return held, planes, named | on_planes
 
 

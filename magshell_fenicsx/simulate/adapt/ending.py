@@ -80,8 +80,8 @@ class CellFields:
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
-            here = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
-            nodes = np.concatenate(scene.comm.allgather(here))
+            own_nodes = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
+            nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             x = chart(scene)
             nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[..., : x.shape[1]]
@@ -113,9 +113,9 @@ class CellFields:
         while len(far := np.flatnonzero(beside > enough)):  # a large cell may have a distant centre
             candidates = self._near.query(x[far], count)[1].reshape(len(far), count)
             for tried in candidates.T:
-                there, off = self._in_cells(x[far], tried)
+                xi_tried, off = self._in_cells(x[far], tried)
                 better = far[off < beside[far]]
-                cells[better], xi[better], beside[better] = (a[off < beside[far]] for a in (tried, there, off))
+                cells[better], xi[better], beside[better] = (a[off < beside[far]] for a in (tried, xi_tried, off))
             if count == len(self.nodes):
                 break
             enough = INSIDE if count <= CANDIDATES else BESIDE
@@ -241,8 +241,8 @@ class History:
             and self.last
             and self.last.amplitude not in ("", "time")
         ):
-            found = _target(scene, self.last)
-            return replace(found, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else found
+            end = _target(scene, self.last)
+            return replace(end, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else end
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
         if not self.located:
@@ -305,8 +305,8 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
         return by_path(scene)
     guess = State(u, dict(near.state.mu))
     is_fold = near.kind == "fold"
-    found = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
-    return found or by_path(scene)
+    from_guess = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
+    return from_guess or by_path(scene)
 
 
 def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:

@@ -203,16 +203,16 @@ def adapted(problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doin
     while True:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
         fine = _moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
-        here = _judged(choice, coarse, fine)
-        tried.append((here, choice))
+        judged = _judged(choice, coarse, fine)
+        tried.append((judged, choice))
         say(
-            f"tolerance {tolerance:g}: degree {here.degree}, {here.cells} cells, {here.dofs} unknowns: "
-            f"result {here.result:.9g}, estimated error {here.estimate:.1e}"
+            f"tolerance {tolerance:g}: degree {judged.degree}, {judged.cells} cells, {judged.dofs} unknowns: "
+            f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
         )
         least = 0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance  # what is cheap is not made worse
-        if least <= here.estimate <= tolerance or len(tried) == MOST_ROUNDS:
+        if least <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
             break
-        another = _remeshed(choice, coarse, fine, AIM * tolerance / here.estimate)
+        another = _remeshed(choice, coarse, fine, AIM * tolerance / judged.estimate)
         if another is None:
             break
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")

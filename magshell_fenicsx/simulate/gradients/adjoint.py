@@ -187,9 +187,9 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     left = np.asarray(-fold.left / pull)
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
-    here = Place(stage.leave(fold.state), np.array(w), rows)
+    place = Place(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
-    return with_begins(Adjoint(scene, [here], value=fold.value, gas=gas, free=fold.name), record, begins)
+    return with_begins(Adjoint(scene, [place], value=fold.value, gas=gas, free=fold.name), record, begins)
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -227,13 +227,13 @@ def by_amplitude(
     model: Observed, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
 ) -> list[tuple[FormTerm, float]]:
     """The derivatives of energies by an amplitude that multiplies some of them and may enter others; with factors."""
-    found = [(term, 1.0) for term in terms if term.amplitude == name]
+    factors = [(term, 1.0) for term in terms if term.amplitude == name]
     p = model.system.parameters[name].constant if name in model.system.parameters else None
     for term in terms:
         if p in term.form.constants():
             slope = FormTerm(f"{term.name} by {name}", derived(term.form, p), model.u, KernelLog(), term.amplitude)
-            found.append((slope, factor_of(term.amplitude, mu)))
-    return found
+            factors.append((slope, factor_of(term.amplitude, mu)))
+    return factors
 
 
 def adjoint(
@@ -248,26 +248,26 @@ def adjoint(
     """
     state = scene.model.system.placed(record.point.state)
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
-    found = functional(scene, state, column)
+    result = functional(scene, state, column)
     held = held_at(scene, record, state, hold)
-    if free := [name for name in found.by_mu if name not in held and not found.slope]:
+    if free := [name for name in result.by_mu if name not in held and not result.slope]:
         raise CaseError(f"{free[0]}: is a load here, which no parameter changes: hold its conjugate")
-    w, rows = solved(scene, state, found, held)
-    by_itself = None if found.energy else lambda there, at: functional(there, at, column).value
-    if found.reaction is not None:
+    w, rows = solved(scene, state, result, held)
+    by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
+    if result.reaction is not None:
         unit = force_unit(scene)
-        by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
-        w = w + found.reaction
-    here = Place(state, w, rows, found.energy, found.potentials)
+        by_itself = lambda there, _: result.value * force_unit(there) / unit  # noqa: E731
+        w = w + result.reaction
+    place = Place(state, w, rows, result.energy, result.potentials)
     made = Adjoint(
         scene,
-        [here],
-        found.by_mu,
+        [place],
+        result.by_mu,
         by_itself,
-        value=found.value,
+        value=result.value,
         gas=with_gas(held),
         scale=scale,
-        slope=found.slope,
+        slope=result.slope,
     )
     return with_begins(made, record, begins) if hold is None else made
 
@@ -351,14 +351,14 @@ def _driven(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
 
 def by_load(adjoint: Adjoint, name: str) -> float:
     """dJ/dmu of an amplitude that is given at all places where it is the same."""
-    scene, system, found = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
+    scene, system, total = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
     for place in adjoint.places:
         if name in place.rows or name in place.driven:
             continue
         u, mu = place.state.u, place.state.mu
-        found += dot(system.comm, place.w, system.load(u, mu, name, held=False))
-        found += place.energy and place.energy * system.potential(u, mu, name)
-        found += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
+        total += dot(system.comm, place.w, system.load(u, mu, name, held=False))
+        total += place.energy and place.energy * system.potential(u, mu, name)
+        total += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
     if adjoint.directions:
         mu = adjoint.state.mu
         terms = [
@@ -367,8 +367,8 @@ def by_load(adjoint: Adjoint, name: str) -> float:
             for slope, factor in by_amplitude(scene.model, [term], name, mu)
         ]
         own = system.at(adjoint.state).of(lambda: sum(c * term.energy() for term, c in terms))
-        found += system.comm.allreduce(own)
-    return float(found)
+        total += system.comm.allreduce(own)
+    return float(total)
 
 
 def held_by_step(step: ProgrammeStep) -> list[str]:
@@ -426,12 +426,12 @@ def held_at(
 
 def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
     """The energies of the directions, and their factors."""
-    model, found = scene.model, list[tuple[FormTerm, float]]()
+    model, energies = scene.model, list[tuple[FormTerm, float]]()
     for d in adjoint.directions:
         phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)
         if d.stiffness:
             assert model.axisymmetric
-            found += [(term, d.stiffness) for term in model.waves.along(phi, d.wave or 0)]
+            energies += [(term, d.stiffness) for term in model.waves.along(phi, d.wave or 0)]
         if d.inertia:
-            found.append((mass_along(model, phi, d.wave), d.inertia))
-    return found
+            energies.append((mass_along(model, phi, d.wave), d.inertia))
+    return energies

@@ -116,11 +116,11 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
 
 def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
     """The same in another scene on the same mesh."""
-    known = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
+    mu = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
     places = []
     for place in adjoint.places:
         u, w = (transfer(adjoint.scene, other, v) for v in (place.state.u, place.w))
-        places.append(replace(place, state=State(u, known | dict(place.state.mu)), w=w))
+        places.append(replace(place, state=State(u, mu | dict(place.state.mu)), w=w))
     directions = [
         d if d.wave is not None else replace(d, phi=transfer(adjoint.scene, other, d.phi)) for d in adjoint.directions
     ]
@@ -129,15 +129,15 @@ def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
 
 def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
     """The shares of the conjugates of free parameters of terms."""
-    system, c, found = scene.model.system, place.conjugates, list[Share]()
+    system, c, shares = scene.model.system, place.conjugates, list[Share]()
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
             if isinstance(slope, Slope) and not slope.density.on_edges:
                 slope = _as_form(scene, slope)
             if not isinstance(slope, FormTerm):
                 raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
-            found.append(Share(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
-    return found
+            shares.append(Share(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
+    return shares
 
 
 def _as_form(scene: Scene, slope: Slope) -> FormTerm:
@@ -156,7 +156,7 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     model, domain = scene.model, f.function_space.mesh
     assert model.thin  # on which no bodies press
     axes = model.axes
-    found = np.zeros(
+    slopes = np.zeros(
         (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)
     )
     for contact in scene.problem.loads.contacts:
@@ -164,9 +164,9 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
             continue
         of_body = [share for share in shares if share.term.name.startswith(f"contact {contact.body}")]
         forces = domain.comm.allreduce(summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1)))
-        if (there := _basis_at(model, f, contact.start[axes])) is not None:
-            found[there[0]] -= float(forces @ contact.lift[axes]) * there[1]
-    return found[..., None]
+        if (at_start := _basis_at(model, f, contact.start[axes])) is not None:
+            slopes[at_start[0]] -= float(forces @ contact.lift[axes]) * at_start[1]
+    return slopes[..., None]
 
 
 def _basis_at(model: ShellModel | MeridianModel, f: fem.Function, x: Array) -> tuple[int, Array] | None:
@@ -263,9 +263,9 @@ def _normals(scene: Scene, drawn: Array) -> Array:
     if not model.thin or not isinstance(scene.problem.embedding, Deviated):
         return drawn
     unit, width = model.growth((lambda x: np.ones(len(x)),)), model.V.dofmap.bs
-    found = np.zeros_like(drawn)
-    found[..., model.axes] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
-    return found
+    normals = np.zeros_like(drawn)
+    normals[..., model.axes] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
+    return normals
 
 
 def _perfect(scene: Scene, places: Array, normals: Array) -> Array:
@@ -306,7 +306,7 @@ def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
     return float(value), FieldGradient(t, np.asarray(density), places[:cells], normals[:cells])
 
 
-def density(scene: Scene, found: FieldGradient) -> Array:
+def density(scene: Scene, gradient: FieldGradient) -> Array:
     """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes, components); collective.
 
     With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the vertices,
@@ -316,14 +316,14 @@ def density(scene: Scene, found: FieldGradient) -> Array:
     is what J changes by where the field changes by one over a unit of area, averaged over about a cell. The sum of
     g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
     """
-    V, nodes = scene.model.V, found.field.function_space.element.basix_element.points
+    V, nodes = scene.model.V, gradient.field.function_space.element.basix_element.points
     H = fem.functionspace(V.mesh, ("Lagrange", 1))
-    hat, count = H.element.basix_element, len(found.forces)
+    hat, count = H.element.basix_element, len(gradient.forces)
     area = fem.Function(H)
     form = scene.model.kernels.compile("area of a vertex", scene.model.over_area()(ufl.TestFunction(H)))
     fem.assemble_vector(area.x.array, form)
     _added(area)
-    shares = np.einsum("cnk,nv->cvk", found.forces, hat.tabulate(0, nodes)[0, :, :, 0])
+    shares = np.einsum("cnk,nv->cvk", gradient.forces, hat.tabulate(0, nodes)[0, :, :, 0])
     at_vertices = []
     for component in np.moveaxis(shares, -1, 0):
         g = fem.Function(H)

@@ -128,24 +128,24 @@ def _moved(scene: Scene, other: Scene, state: State) -> State:
 
 def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
     """The residual and the rows of a place in another scene; what is held stays the same number of its unit."""
-    system, here = other.model.system, place.state
-    found = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
+    system, own_state = other.model.system, place.state
+    change = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
     targets = goals(scene, other, "conjugate", place.steps)
     for name, c in place.rows.items():
-        held = -scene.model.system.potential(here.u, here.mu, name)
+        held = -scene.model.system.potential(own_state.u, own_state.mu, name)
         unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
         same = 1.0 if name in place.follows else unit
-        found += c * (system.potential(state.u, state.mu, name) + same * held)
-    return float(found)
+        change += c * (system.potential(state.u, state.mu, name) + same * held)
+    return float(change)
 
 
 def _own(other: Scene, place: Place, state: State) -> float:
     """What J itself contains of a place."""
     system = other.model.system
-    found = sum(c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items())
+    value = sum(c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items())
     if place.energy:
-        found += place.energy / other.model.multiplicity * sum(other.energies(state).values())
-    return float(found)
+        value += place.energy / other.model.multiplicity * sum(other.energies(state).values())
+    return float(value)
 
 
 def gradient(
@@ -198,10 +198,10 @@ def gradient(
         raise CaseError(f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}")
     begins = {record.step: begin} if begin else {}
     if of == "instability" or (isinstance(of, str) and of in FOLDS):
-        found = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
+        adjoint = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
     else:
-        found = adjoint_at_end(scene, History(record, record, begin, begins=begins), of, hold)[1]
-    return {name: derivative(found, name) for name in ([by] if isinstance(by, str) else by)}
+        adjoint = adjoint_at_end(scene, History(record, record, begin, begins=begins), of, hold)[1]
+    return {name: derivative(adjoint, name) for name in ([by] if isinstance(by, str) else by)}
 
 
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
@@ -210,8 +210,8 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
         raise CaseError(f"{by}: of shells that may touch each other gradients are not built")
     size = adjoint.size
     if by in FIELDS:
-        found = by_field(adjoint, by)
-        return replace(found, forces=size * found.forces)
+        of_field = by_field(adjoint, by)
+        return replace(of_field, forces=size * of_field.forces)
     if by in adjoint.state.mu:
         return size * by_amplitude(adjoint, by)
     return size * by_number(adjoint, by, others) + adjoint.value * size_by_number(adjoint, by)

@@ -28,18 +28,18 @@ class Lost(RuntimeError):
 
 def located(records: Sequence[Record], amplitude: str) -> list[Record]:
     """Where the path loses its stability in an amplitude."""
-    there = [r for r in records if r.amplitude == amplitude and not r.branch]
-    return [r for r in there if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)]
+    in_amplitude = [r for r in records if r.amplitude == amplitude and not r.branch]
+    return [r for r in in_amplitude if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)]
 
 
 def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
     """Those up to the first bifurcation at which a step leaves the path."""
-    found, steps = list[Record](), scene.problem.programme
+    before_branch, steps = list[Record](), scene.problem.programme
     for record in records:
-        found.append(record)
+        before_branch.append(record)
         if record.label == "bifurcation" and record.step and leaves_path(steps[record.step - 1]):
             break
-    return found
+    return before_branch
 
 
 def load(record: Record, amplitude: str) -> float:
@@ -72,18 +72,18 @@ def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
     column = in_units(scene, end.point.state, of)[0] if isinstance(of, str) else ""
     load = end.amplitude in FOLDS.values() and column in (end.amplitude, quantities.amplitude(end.amplitude).column)
     if end.label in ("fold", "bifurcation") and not load:
-        known = ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude) or "none"
+        allowed = ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude) or "none"
         raise Lost(
-            f"the path ends at a {end.label}, which moves with what varies: only its load has a gradient ({known})"
+            f"the path ends at a {end.label}, which moves with what varies: only its load has a gradient ({allowed})"
         )
 
 
-def as_asked(found: Adjoint, of: object) -> Adjoint:
+def as_asked(adjoint: Adjoint, of: object) -> Adjoint:
     """With the unit of the result."""
     if of not in SCALES:
-        return found
-    refuse_unitless(found.scene, str(of))
-    return replace(found, scale=SCALES[str(of)])
+        return adjoint
+    refuse_unitless(adjoint.scene, str(of))
+    return replace(adjoint, scale=SCALES[str(of)])
 
 
 def instabilities(
@@ -104,15 +104,15 @@ def instabilities(
         If there is none, or the lowest one has no gradient.
     """
     amplitude = FOLDS[of]
-    there = sorted(located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude))
-    found = list[tuple[str, Adjoint]]()
-    for record in [r for r in there if load(r, amplitude) <= BESIDE * load(there[0], amplitude)][:most]:
+    ascending = sorted(located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude))
+    by_name = list[tuple[str, Adjoint]]()
+    for record in [r for r in ascending if load(r, amplitude) <= BESIDE * load(ascending[0], amplitude)][:most]:
         name = record.mode or record.label
         try:
-            found.append((name, as_asked(adjoint_of_instability(scene, record, begins=begins), of)))
+            by_name.append((name, as_asked(adjoint_of_instability(scene, record, begins=begins), of)))
         except CaseError as e:
-            if not found:
+            if not by_name:
                 raise Lost(str(e)) from None
-    if not found:
+    if not by_name:
         raise Lost(f"the path has no instability in {amplitude}")
-    return sorted(found, key=lambda each: abs(each[1].value))
+    return sorted(by_name, key=lambda each: abs(each[1].value))

@@ -113,8 +113,8 @@ def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Se
             elif NAMES.fullmatch(of):
                 refuse_no_vibration(scene.problem, of)
             elif of not in FOLDS and of not in columns and of not in start.mu:
-                known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
-                raise CaseError(f"{of}: has no gradient here; allowed are {known}")
+                allowed = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
+                raise CaseError(f"{of}: has no gradient here; allowed are {allowed}")
         except CaseError as e:
             raise CaseError(f"{key}: {e}") from None
 

@@ -191,21 +191,21 @@ def adjoints_of_vibrations(
             "far less than a difference takes; take differences of runs"
         )
     held = held_at(scene, record, state, hold)
-    found = vibrations(scene, state, of, beside=beside, most=most)
-    made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in found]
+    kinds = vibrations(scene, state, of, beside=beside, most=most)
+    made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in kinds]
     return made if hold is not None else [(kind, with_begins(each, record, begins)) for kind, each in made]
 
 
-def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) -> Adjoint:
-    value = frequency(scene.problem, of, found.value)
-    rate = 1.0 if of.startswith("omega2") else value / (2 * found.value)
-    c = rate / len(found.modes)
-    slopes = [_slopes(scene, state, mode, list(held)) for mode in found.modes]
+def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: Held) -> Adjoint:
+    value = frequency(scene.problem, of, vibration.value)
+    rate = 1.0 if of.startswith("omega2") else value / (2 * vibration.value)
+    c = rate / len(vibration.modes)
+    slopes = [_slopes(scene, state, mode, list(held)) for mode in vibration.modes]
     by_u = np.sum([s.by_u for s in slopes], axis=0) * c
     by_mu = {name: c * sum(s.by_mu[name] for s in slopes) for name in held}
     w, rows = solved(scene, state, Functional(value, by_u, by_mu), held)
     places, directions = [Place(state, w, rows)], list[Direction]()
-    for mode in found.modes:
+    for mode in vibration.modes:
         if (m := _wave(mode)) is not None:
             directions.append(Direction(mode.vector, m, stiffness=c, inertia=-c * mode.eigenvalue))
             continue
@@ -214,7 +214,7 @@ def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) 
             moved = State(state.u + way * step * mode.vector, state.mu)
             places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
-    by_itself = lambda there, _: frequency(there.problem, of, found.value)  # noqa: E731
+    by_itself = lambda there, _: frequency(there.problem, of, vibration.value)  # noqa: E731
     gas = with_gas(held)
     return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas)
 
