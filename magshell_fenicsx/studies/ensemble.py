@@ -121,7 +121,7 @@ def ensemble(
     folder, name = given_folder(out), Path(file).name
     parts = [Path(place) for place in merge]
     if resume or merge:
-        by_first(comm, lambda: _refuse_strange(parts or [folder], every))
+        by_first(comm, lambda: _refuse_strange(parts or [folder], every, merge=bool(merge)))
     tables = (f"summary{ending}.json", f"samples{ending}.csv", f"ensemble{ending}.png", f"report{ending}.md")
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
@@ -179,9 +179,12 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
     return bool(outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED))
 
 
-def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample]) -> None:
+def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge: bool) -> None:
+    """See that each place has a sample of this ensemble; one that was killed before its first sample begins again."""
     for place in places:
-        if not any(kept_outcome(_file(place, key)) for key in keys):
+        points = place / "points"
+        begun = not merge and points.is_dir() and not any(points.glob("*.json"))
+        if not begun and not any(kept_outcome(_file(place, key)) for key in keys):
             raise CaseError(
                 f"{place}: has no sample of this ensemble that these sources computed: look at case, --seed and --set"
             )

@@ -201,11 +201,22 @@ def test_failed_samples_are_counted_and_listed(tmp_path: Path, monkeypatch: pyte
     assert again.rows[0]["status"] == "found"
 
 
+def test_killed_before_the_first_sample(tmp_path: Path) -> None:
+    """Only an unfinished file is there: `--resume` begins, and finds nothing of another ensemble."""
+    (tmp_path / "points").mkdir()
+    (tmp_path / "points" / "key.unfinished").touch()
+    settings = [RANDOM, *COARSE]
+    again = ensemble(DIMPLE, settings, samples=1, seed=1, out=tmp_path, result="energy@end", resume=True)
+    assert again.rows[0]["status"] == "found"
+    with pytest.raises(CaseError, match="has no sample of this ensemble"):
+        ensemble(DIMPLE, settings, samples=1, seed=2, out=tmp_path, result="energy@end", resume=True)
+
+
 @pytest.mark.slow
 def test_ranks_give_the_table_of_one(tmp_path: Path, alone: list[dict[str, str]]) -> None:
     """In any order, with other folds to begin with; on three ranks killed after a sample, resumed on two."""
     run, points = start("ensemble", DIMPLE, *THREE, "--out", tmp_path, ranks=3), tmp_path / "points"
-    wait_until(lambda: points.is_dir() and any(points.iterdir()))
+    wait_until(lambda: points.is_dir() and any(points.glob("*.json")))
     kill(run, 3)
     assert not (tmp_path / "samples.csv").exists()
     done = magshell("ensemble", DIMPLE, *THREE, "--out", tmp_path, "--resume", ranks=2)
