@@ -186,6 +186,7 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
         np.concatenate(one),
         patches,
         given,
+        shells=tuple(member.name for member in members),
     )
 
 
