@@ -301,7 +301,10 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     """
     ground = ground_of(case.shell)
     perfect = ground.perfect
-    parts = [of_shape(case.shell, perfect), *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches))]
+    parts = [
+        of_shape(case.shell, perfect),
+        *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches)),
+    ]
     vectors = [unit(v) for part in parts for v in part.vectors]
     planes = [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
     for one in planes:

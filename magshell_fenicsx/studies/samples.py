@@ -58,7 +58,9 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, 
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
     if section.defects and source.data.get("shells"):
-        raise CaseError("ensemble.defects: are of a shell alone: give keys, shells.NAME.shell.imperfections.0.amplitude")
+        raise CaseError(
+            "ensemble.defects: are of a shell alone: give keys, shells.NAME.shell.imperfections.0.amplitude"
+        )
     refuse_unknown_keys(source, section, made)
     samples = []
     for number in numbers:

@@ -42,4 +42,7 @@ def test_names_of_shells(tmp_path: Path) -> None:
     names = view.panel(shell(read, about.h)[0], OutputSection()).names
     camera = Camera(np.array([0.0, -0.1, 1.0]))
     left, right = (camera(np.array([[x, 0.25, 0.0]]))[0, 0] for x in (0.5, 1.5))
-    assert {name: x for x, _, name in names} == {"left": pytest.approx(left, abs=0.1), "right": pytest.approx(right, abs=0.1)}
+    assert {name: x for x, _, name in names} == {
+        "left": pytest.approx(left, abs=0.1),
+        "right": pytest.approx(right, abs=0.1),
+    }

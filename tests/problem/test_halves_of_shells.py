@@ -59,7 +59,10 @@ HALVES: dict[str, tuple[str, dict[str, Any]]] = {
     "tubes with one axis": (
         "oblique",
         {
-            "shells": {"low": tube(0), "high": tube(1, thickness_factor="1 + x*y/4") | {"points": {"end": [0, -1, 0.5]}}},
+            "shells": {
+                "low": tube(0),
+                "high": tube(1, thickness_factor="1 + x*y/4") | {"points": {"end": [0, -1, 0.5]}},
+            },
             "loading": dead({"over": "high", "per_area": [1e-7, 1e-7, 0]}),
             "mesh": {"degree": 3, "size": 0.27},  # 24 elements around the axis, a line of them at 45 degrees
         },

@@ -169,9 +169,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     jump, strain_jump = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
     named = grid.GetFieldData().GetAbstractArray(SHELLS)
     shells = tuple(named.GetValue(i) for i in range(named.GetNumberOfValues())) if named else ()
-    return Surface(
-        r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells
-    ), about
+    return Surface(r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells), about
 
 
 class FieldSeries:

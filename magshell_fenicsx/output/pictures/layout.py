@@ -179,7 +179,9 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
         axes.text(x, y, text, ha="center", va="center", color="white", weight="bold", fontsize=0.9 * style.font_size)
     for x, y, name in panel.names:
         around = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
-        axes.text(x, y, name, ha="center", va="center", color="0.1", fontsize=0.9 * style.font_size, path_effects=around)
+        axes.text(
+            x, y, name, ha="center", va="center", color="0.1", fontsize=0.9 * style.font_size, path_effects=around
+        )
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
 
