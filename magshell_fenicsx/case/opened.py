@@ -107,9 +107,13 @@ def _of_data(case: Case, key: str, value: Any) -> Case:
     if case.origin.data is None:
         raise CaseError(f"{key}: needs a case that was read from a file or a mapping: see Case.from_source")
     data = _written(case.origin.data, key, value)
-    made = _validated(data, case, key).with_terms(case.own_terms)
+    tolerance = case.mesh.tolerance
+    bare = _written(data, "mesh.tolerance", None) if tolerance else data  # what it chooses is no mistake
+    made = _validated(bare, case, key).with_terms(case.own_terms)
     kept = {name: getattr(case, name) for name in type(case).model_fields if name not in OF_SHELLS}
-    kept["mesh"] = made.mesh
+    kept["mesh"] = made.mesh.model_copy(update={"tolerance": tolerance})
+    if key.startswith("shells."):  # targets are over its numbers
+        kept["loading"] = made.loading
     if "magnetic" in kept and any(section.remanent for section in (made.shells or {}).values()):
         kept["magnetic"] = made.magnetic
     again = made.model_copy(update=kept)

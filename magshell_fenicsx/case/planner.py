@@ -12,9 +12,10 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import changed, perfect_case
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.grading import Disc, Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
-from magshell_fenicsx.mesh.mirror import Y0, Mirror, Sector, rotation
+from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror, Sector, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
@@ -48,7 +49,7 @@ from magshell_fenicsx.problem.sizes import Loaded, grading
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, sector, unmirrored
+from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, sector, unit, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
@@ -56,8 +57,8 @@ SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
 FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
 
-def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
-    """The problem of a case, with its user-defined energies and `terms`.
+def make_problem(case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None = None) -> Problem:
+    """The problem of a case, with its user-defined energies and `terms`; its half at a plane that is `kept`, if given.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
     parts = _left(case, drawn, energies)
     parts += leaves(imperfections, perfect, each=bool(case.patches))
     parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
-    axisymmetric, plane = _symmetry(case, drawn, parts)
+    axisymmetric, plane = (False, plane) if plane else _symmetry(case, drawn, parts)
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
@@ -161,7 +162,7 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
         azimuth=turn,
         turns=askew(parts) is None,
         shape=shape,
-        embedding=drawn.embedding,
+        embedding=drawn.placed(shape),
         points=points,
         size=size,
         included=[*included, *(f"own energy: {term.name}" for term in terms)],
@@ -289,6 +290,30 @@ def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Ch
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
+def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
+    """A plane in which the mid-surface with its thickness and imperfections is its own image, with the edges that are
+    lost; else None.
+
+    Parameters
+    ----------
+    loosely
+        See `mesh_mirrors`.
+    """
+    ground = ground_of(case.shell)
+    perfect = ground.perfect
+    parts = [
+        of_shape(case.shell, perfect),
+        *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches)),
+    ]
+    vectors = [unit(v) for part in parts for v in part.vectors]
+    planes = [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
+    for one in planes:
+        same = np.abs(one.plane - plane.plane).max() < ROUNDING if one.plane.shape == plane.plane.shape else False
+        if same and all(abs(one.normal @ v) < ROUNDING for v in vectors) and all(part.mirrors(one) for part in parts):
+            return one
+    return None
+
+
 def part_of(plane: Mirror | None) -> str:
     """What of the shell is modelled, in words."""
     if isinstance(plane, Sector):
@@ -325,6 +350,7 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
             raise CaseError(f"symmetry: half: the energy {name} does not share it")
         made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
         hint = made if isinstance(case.shell, MeshSurface) else ""
+        hint = "; each shell is held, and its own image in it" if case.several else hint
         raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
     return False, plane
 
@@ -349,7 +375,8 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
 def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:
     """About how many triangles there will be."""
     if isinstance(shape, MeshFile):
-        return cell_count(shape) * (0.5 if half else 1.0)
+        halved = isinstance(shape.given, Assembly)  # it has the cells of its half
+        return cell_count(shape) * (0.5 if half and not halved else 1.0)
     return shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
 
 

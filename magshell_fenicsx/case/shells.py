@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
+from magshell_fenicsx.case.members import Members
 from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section, or_number, texts
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Assembly, Member, Place
-from magshell_fenicsx.mesh.patch import GivenField, MeshError
+from magshell_fenicsx.mesh.assembly import Assembly, Place
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.ground import Coordinates
@@ -139,20 +140,14 @@ class Several:
         """All of them as one mesh."""
         materials = self.materials or {}
         moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
-        return Assembly(self.digest, self._members, self.joints, self._thicknesses, moduli)
+        members = Members(self)
+        return Assembly(
+            self.digest, members.whole, self.joints, self._thicknesses, moduli, members.mirrors, members.half
+        )
 
-    def _members(self) -> list[Member]:
-        members = []
-        for part in self.parts:
-            try:
-                problem = part.case.problem()
-                if problem.awaited:
-                    raise CaseError("shell.imperfections: kind: modes: is of a shell alone: take another kind")
-                patch = problem.triangulated()
-            except (CaseError, MeshError) as e:
-                raise type(e)(part.refused(str(e))) from None
-            members.append(Member(part.name, patch, self.place(part), tuple(part.section.points)))
-        return members
+    def of(self, name: str) -> str:
+        """The shell of an edge, or itself."""
+        return next((part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name)
 
     @cached_property
     def thickness(self) -> "Thickness | None":

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import CUT, Mirror
 from magshell_fenicsx.mesh.patch import (
     Embedding,
     MeshError,
@@ -105,6 +106,12 @@ class Assembly:
         Name of a shell -> its thickness over that of the first; None where it varies.
     moduli
         Name of a shell -> its Young's modulus over that of the first.
+    mirrors
+        Planes in which each shell is its own image, see `Outline.mirrors`.
+    half
+        Its half at such a plane, on whose positive side it is.
+    halved
+        Whether it is a half itself: edges on its plane are one, `CUT`.
     home
         None: no program gave a mesh.
     """
@@ -114,6 +121,9 @@ class Assembly:
     joints: Sequence[tuple[str, str]] = ()
     thicknesses: Mapping[str, float | None] = field(default_factory=dict)
     moduli: Mapping[str, float] = field(default_factory=dict)
+    mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)
+    half: Callable[[Mirror], "Assembly"] | None = field(default=None, repr=False)
+    halved: bool = False
     home: None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Assembly":
@@ -122,7 +132,7 @@ class Assembly:
     @cached_property
     def patch(self) -> PatchMesh:
         """All of them as one triangulation."""
-        return joined(together(self.members()), self.joints)
+        return joined(together(self.members(), halved=self.halved), self.joints)
 
     @property
     def cells(self) -> NDArray[np.int64]:
@@ -130,10 +140,10 @@ class Assembly:
         return self.patch.cells
 
 
-def together(members: Sequence[Member]) -> PatchMesh:
+def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
     """One triangulation of shells that do not share a node; names of edges and points begin with that of the shell.
 
-    Each shell is a patch with its name.
+    Each shell is a patch with its name. The edges of `halved` ones on their plane are one edge.
     """
     most = max(member.patch.cells.shape[1] for member in members)
     embeddings = tuple((m.patch.embedding, m.patch.nodes.shape[1], m.place) for m in members)
@@ -155,7 +165,10 @@ def together(members: Sequence[Member]) -> PatchMesh:
         nodes.append(in_assembly(patch.nodes, number))
         cells.append(patch.cells + first)
         one.append((np.arange(count) if patch.one is None else patch.one) + first)
-        edges |= {f"{member.name}_{name}": pairs + first for name, pairs in patch.edges.items()}
+        for name, pairs in patch.edges.items():
+            on_plane = halved and name == CUT
+            before = [edges[CUT]] if on_plane and CUT in edges else []
+            edges[name if on_plane else f"{member.name}_{name}"] = np.concatenate([*before, pairs + first])
         points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in member.points}
         every = np.ones(len(patch.cells), dtype=bool)
         for name, of in {"": every, **patch.patches}.items():
@@ -173,6 +186,7 @@ def together(members: Sequence[Member]) -> PatchMesh:
         np.concatenate(one),
         patches,
         given,
+        shells=tuple(member.name for member in members),
     )
 
 

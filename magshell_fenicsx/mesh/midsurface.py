@@ -131,6 +131,11 @@ class Midsurface:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
+    @property
+    def shells(self) -> tuple[str, ...]:
+        """Their names, where there are several."""
+        return self._patch.shells
+
     def beside(self, point: str) -> NDArray[np.bool_] | None:
         """Whether each cell of this rank, ghosts too, is of the shell of a named point; None if there is one shell.
 

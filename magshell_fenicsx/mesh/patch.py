@@ -145,6 +145,8 @@ class PatchMesh:
     feet
         Of a mesh file in which an edge has three triangles: name of an edge that stands on another sheet -> whether
         each triangle is one on which it does.
+    shells
+        Names of the patches that are shells, of which there are several.
     """
 
     nodes: NDArray[np.float64]
@@ -157,6 +159,7 @@ class PatchMesh:
     given: NDArray[np.int64] | None = None
     joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None, ...] = ()
     feet: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    shells: tuple[str, ...] = ()
 
     @property
     def corners(self) -> NDArray[np.int64]:

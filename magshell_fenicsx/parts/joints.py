@@ -19,6 +19,7 @@ from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from dolfinx import fem
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.mesh.midsurface import Midsurface
     from magshell_fenicsx.models.shell.energy import Density
     from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.shape.outline import Outline
 
 AMPLITUDE = "fold"
 
@@ -102,6 +104,11 @@ class Joined(KeyAbility[Sequence[JointSection]]):
                 if name in taken:
                     raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")
                 taken.add(name)
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """Planes that cross each joint: its edges are their own mirror images."""
+        names = [name for section in self.given for name in section.edges]
+        return [Leaves("joints: shells are joined", mirrors=lambda mirror: all(mirror.other(n) == n for n in names))]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         scales = context.scales if any(section.stiffness for section in self.given) else None

@@ -143,6 +143,12 @@ class Outline:
         )
         return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
 
+    def placed(self, shape: Chart) -> Embedding:
+        """The map to space of what is meshed: shells of which there are several each have a chart in their own frame."""
+        if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly) and shape.given.halved:
+            return shape.given.patch.embedding
+        return self.embedding
+
     @property
     def disc(self) -> bool:
         """Whether it is of revolution about e3, up to its pole."""
@@ -172,8 +178,15 @@ def outline(shell: Surface | ShellSection) -> Outline:
     if isinstance(shell, MeshSurface):
         scale, given = (shell.unit or 1.0) / shell.reference, shell.files.given.get(shell.path)
         file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, given)
-        if isinstance(given, Assembly):  # each member has its own mirrors, and all together none that is looked for
-            return Outline(lambda mirror, size: file, given.patch.embedding, normals, lambda x: x, None)
+        if isinstance(given, Assembly):
+            return Outline(
+                lambda mirror, size: replace(file, given=given.half(mirror)) if mirror and given.half else file,
+                given.patch.embedding,
+                normals,
+                lambda x: x,
+                None,
+                mirrors=given.mirrors,
+            )
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:

@@ -51,7 +51,8 @@ def number_of(context: Context, key: str) -> float:
         raise CaseError(f"{key}: the fractions of the layers add up to 1: one alone has no gradient")
     if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
-    section, _, rest = key.partition(".")
+    own = key.split(".", 2)[2] if key.startswith("shells.") else key  # of one of several shells, in its own section
+    section, _, rest = own.partition(".")
     geometry = section == "shell" and rest.split(".")[0] not in (*OF_MATERIAL, *OF_DEVIATION)
     if section in ELSEWHERE or geometry:
         raise CaseError(f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here")

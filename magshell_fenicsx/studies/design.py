@@ -303,7 +303,7 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
         return made.variables.made(from_first(comm, lambda: read_source(file, settings)))
 
     case = best_case()
-    if case.shell.geometry != "mesh":
+    if case.several or case.shell.geometry != "mesh":
         settings = [f"mesh.refinement={case.mesh.refinement * wanted.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"

@@ -57,6 +57,10 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, 
     section = made(source).ensemble
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
+    if section.defects and source.data.get("shells"):
+        raise CaseError(
+            "ensemble.defects: are of a shell alone: give keys, shells.NAME.shell.imperfections.0.amplitude"
+        )
     refuse_unknown_keys(source, section, made)
     samples = []
     for number in numbers:
@@ -82,8 +86,9 @@ def _sample(source: Source, number: int, drawn: Mapping[str, str], made: Made, d
         if len(ranked) <= deleted:
             raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects")
         gone = {id(defect) for defect in ranked[:deleted]}
-        shell = drawn_source.data["shell"]
-        shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]
+        for shell, _ in _shells(drawn_source.data, case):
+            if "imperfections" in shell:
+                shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]
         case = made(drawn_source)
     case.problem()
     return Sample(number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case))
@@ -101,13 +106,21 @@ def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
 
 def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
     """The defects with an amplitude as the case has them, the weakest first; amplitudes with units count over h."""
-    shell = data["shell"]
-    listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
-    single = getattr(case.shell, "defect", None)
-    sections = case.shell.imperfections or ([single] if single else [])
-    sizes = [getattr(section, "amplitude", None) for section in sections]
-    sized = [(abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None]
+    sized = list[tuple[float, dict[str, Any]]]()
+    for shell, section in _shells(data, case):
+        listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
+        single = getattr(section, "defect", None)
+        sections = section.imperfections or ([single] if single else [])
+        sizes = [getattr(each, "amplitude", None) for each in sections]
+        sized += [(abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None]
     return [item for _, item in sorted(sized, key=lambda pair: pair[0])]
+
+
+def _shells(data: Any, case: Case) -> list[tuple[dict[str, Any], Any]]:
+    """The data and the section of each shell."""
+    if case.shells:
+        return [(data["shells"][name]["shell"], each.shell) for name, each in case.shells.items()]
+    return [(data["shell"], case.shell)]
 
 
 # errors of pydantic about keys, which no value drawn can mend

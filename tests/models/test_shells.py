@@ -23,8 +23,8 @@ def cap(**shell: Any) -> dict[str, Any]:
 
 
 def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
-    """The scene of a case, the state at its end, and what is observed there."""
-    scene = Scene(Case.from_source(data))
+    """The scene of a case modelled whole, the state at its end, and what is observed there."""
+    scene = Scene(Case.from_source({"symmetry": "none"} | data))
     *_, last = follow(scene)
     return scene, last.point.state, scene.observe(last.point.state)
 

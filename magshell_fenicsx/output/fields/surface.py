@@ -27,6 +27,7 @@ SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strain
 MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
 GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
 PRESSURE = "contact_pressure"  # of bodies and of parts of the shell, over E h/R: the mean over a cell
+SHELL = "shell"  # the number of the shell, where there are several
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
 ON_PLANE = 1e-9  # over R
@@ -58,6 +59,8 @@ class Surface:
         The same of the strains E.
     solids
         The faces of those.
+    shells
+        The names of several shells, in the order of their numbers in the field `shell`; nodes of two are double.
     """
 
     r0: Array
@@ -69,6 +72,7 @@ class Surface:
     jump: float | None = None
     strain_jump: float | None = None
     solids: tuple[Solid, ...] = ()
+    shells: tuple[str, ...] = ()
 
     @property
     def is_body(self) -> bool:
@@ -123,6 +127,8 @@ class SurfaceGatherer:
         deviation = model.midsurface.deviation(self._places, grown(loads.growing, mu))
         if deviation is not None:
             self._fields.constant[W0] = np.asarray(deviation[: self._owned] / model.material.h)
+        if self._model.midsurface.shells:
+            self._fields.constant[SHELL] = self._shell_of()
         n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=-1)[..., None]
         self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
@@ -132,6 +138,7 @@ class SurfaceGatherer:
         loads, fields = self._model.loads, self._fields
         given = [fields.Br, fields.susceptibility, *(loads.natural.at(inside(r), fields.n0) if loads.natural else ())]
         thickness = self._thickness(self._places)
+        given += [self._shell_of()] if self._model.midsurface.shells else []
         given = [self._gathered(f) for f in (*given, *(() if thickness is None else (thickness,))) if f.size]
         r, n0, inner, weight = (
             self._gathered(f) for f in (r, fields.n0, inner, self._stresses.frame.area * self._rule)
@@ -171,7 +178,14 @@ class SurfaceGatherer:
             return None
         smooth, jumps = self._recovered.fields(tensors, self._n0)
         fields = self._constant | smooth | rubber_fields(smooth, self._model.material.law) | averaged
-        return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"])
+        names = self._model.midsurface.shells
+        return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"], shells=names)
+
+    def _shell_of(self) -> Array:
+        """The number of its shell at the nodes of each owned cell."""
+        midsurface = self._model.midsurface
+        inside = [midsurface.patches[name][: self._owned] for name in midsurface.shells]
+        return np.repeat(np.argmax(inside, axis=0)[:, None].astype(np.float64), len(self._places), axis=1)
 
     def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values of all ranks' cells on rank 0, elsewhere those of its own."""
@@ -256,6 +270,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         surface.jump,
         surface.strain_jump,
         surface.solids,
+        surface.shells,
     )
 
 

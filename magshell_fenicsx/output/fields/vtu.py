@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
 FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
+SHELLS = "shells"  # their names, in the order of the numbers in `shell`
 OWN_DATA = ("u", "u_over_h", "w_over_h", "r0", "n0")
 UNITS = {  # of the arrays, for those who open them elsewhere
     **dict.fromkeys(("points", "u", "r0"), "R"),
@@ -166,7 +167,9 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     if not all(np.isfinite(values).all() for values in (r0, u, n0)):
         raise ValueError("a node is nowhere")
     jump, strain_jump = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
-    return Surface(r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump), about
+    named = grid.GetFieldData().GetAbstractArray(SHELLS)
+    shells = tuple(named.GetValue(i) for i in range(named.GetNumberOfValues())) if named else ()
+    return Surface(r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells), about
 
 
 class FieldSeries:
@@ -288,13 +291,16 @@ def vtu_content(surface: Surface, about: About) -> bytes:
     for name, values in numbers.items():
         if values is not None:
             _give(grid.GetFieldData(), name, values)
-    units = vtkStringArray()
-    units.SetName("units")
     data = grid.GetPointData()
     names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
-    for name in (name for name in names if name in UNITS):
-        units.InsertNextValue(f"{name}: {UNITS[name]}")
-    grid.GetFieldData().AddArray(units)
+    texts = {"units": [f"{name}: {UNITS[name]}" for name in names if name in UNITS], SHELLS: surface.shells}
+    for name, lines in texts.items():
+        array = vtkStringArray()
+        array.SetName(name)
+        for line in lines:
+            array.InsertNextValue(line)
+        if lines or name != SHELLS:
+            grid.GetFieldData().AddArray(array)
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.surface import SHELL, Surface
 from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, from_zero
 
 Array = NDArray[np.float64]
@@ -49,6 +49,7 @@ SCALARS = {  # of the interactive report, in HTML; of vectors the length
     "gap_over_h": "gap/h",
     "contact_pressure": "contact pressure pR/(Eh)",
     "w0_over_h": "imperfections w<sub>0</sub>/h",
+    SHELL: "shell",
 }
 WITH_SIGN = {"w_over_h", *STRAINS, *MOMENTS, "sigma_1", "sigma_2", "p_mag", "k", "contact_pressure", "w0_over_h"}
 ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding

@@ -48,6 +48,8 @@ class Panel:
         Lines (n, 2) in the projection, with their pens: a grey, and matplotlib's name of dashes.
     texts
         Places in the projection, and letters there.
+    names
+        The same of names of shells.
     """
 
     image: Image
@@ -57,6 +59,7 @@ class Panel:
     lines: tuple[tuple[Array, Pen], ...] = ()
     arrows: tuple[Arrow, ...] = ()
     texts: tuple[tuple[float, float, str], ...] = ()
+    names: tuple[tuple[float, float, str], ...] = ()
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -162,7 +165,9 @@ class Boxes:
 
 
 def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
-    """Draw a panel's image, lines and arrows in axes of its proportions."""
+    """Draw a panel's image, lines, arrows and names in axes of its proportions."""
+    from matplotlib.patheffects import withStroke
+
     left, right, low, high = panel.frame
     same = panel.frame == panel.window.box  # pixel by pixel
     axes.imshow(panel.image, extent=panel.window.box, interpolation="none" if same else "antialiased", aspect="auto")
@@ -172,6 +177,11 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
         _draw_arrows(axes, arrows, right - left, style)
     for x, y, text in panel.texts:
         axes.text(x, y, text, ha="center", va="center", color="white", weight="bold", fontsize=0.9 * style.font_size)
+    for x, y, name in panel.names:
+        around = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
+        axes.text(
+            x, y, name, ha="center", va="center", color="0.1", fontsize=0.9 * style.font_size, path_effects=around
+        )
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
 

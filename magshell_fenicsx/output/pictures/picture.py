@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.surface import SHELL, Surface
 from magshell_fenicsx.output.pictures.beside import Beside, bare_outlines, far_said, near_places
 from magshell_fenicsx.output.pictures.colours import (
     Coloured,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+NAMED = ("", "w_over_h")  # layers with the names of shells
 GREY = 0.93  # of a surface without colours
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
 SEEN_APART = (
@@ -122,16 +123,30 @@ class Background:
     def panel(self, layer: Coloured, style: OutputSection) -> Panel:
         """The shell in a layer's colours; grey with arrows if it has none."""
         texts = tuple(self._beside.poles)
+        names = self._names() if layer.name in NAMED else ()
         if not layer.colours:
             arrows = self._arrows()
             image = self._whole(self.seen.plain(GREY))
-            return Panel(image, self.window, self._camera, lines=self._lines, arrows=arrows, texts=texts)
+            return Panel(image, self.window, self._camera, lines=self._lines, arrows=arrows, texts=texts, names=names)
         low, high = style.ranges.get(layer.name, layer.limits)
         image = self.seen.coloured(layer.values, (low, high), colour_map(layer.colours, (low, high)))
         slack = 1e-6 * (high - low)
         beyond = bool(np.nanmin(layer.values) < low - slack), bool(np.nanmax(layer.values) > high + slack)
         scale = Scale((low, high), layer.colours, layer.caption, beyond)
-        return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts)
+        return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts, names=names)
+
+    def _names(self) -> tuple[tuple[float, float, str], ...]:
+        """The name of each of several shells, where it is seen: at the place next to the middle of what is seen of it."""
+        r, number = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
+        if number is None:
+            return ()
+        seen, found = self.seen.shows(r, 2 / self.window.scale), []
+        for i, name in enumerate(self._surface.shells):
+            places = self._camera(r[seen & (np.rint(number) == i)])[:, :2]
+            if len(places):
+                x, y = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]
+                found.append((float(x), float(y), name))
+        return tuple(found)
 
     def plain(self, grey: float) -> Image:
         """The shell in one grey, with what is beside it."""

@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.surface import Surface, on_nodes_of
+from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
@@ -270,6 +270,8 @@ def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed
         elif name in WITH_SIGN:
             low, high = from_zero(low, high)
             colours = _stops(SIGNED, (low, high))
+        if name == SHELL:
+            caption = f"{caption}: {', '.join(f'{i} {each}' for i, each in enumerate(shells[0].shells))}"
         parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in present]
         steps = [np.rint(255 * part).astype(np.uint8) for part in parts]
         still = all((step == steps[0]).all() for step in steps)

@@ -77,20 +77,28 @@ class BoundarySection(Section, Ability):
         part = "symmetry" in self.conditions().values()
         return {"the whole shell": "with boundary: symmetry the case is a part of it alone"} if part else {}
 
+    @property
+    def fixes(self) -> bool:
+        """Whether an edge or a point is held in all directions."""
+        return any(
+            len(each.components) == 3
+            if isinstance(each, HeldSection)
+            else each in ("clamped", "simply supported", "hinged")
+            for each in self.conditions().values()
+        )
+
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """A half does not see rigid motions across its plane: it needs a support against all."""
-        parts, fixed = list[Leaves](), False
+        parts = list[Leaves]()
         for name, condition in self.conditions().items():
-            fixed = fixed or condition in ("clamped", "simply supported", "hinged")
             reason = None
             if isinstance(condition, HeldSection):
-                fixed = fixed or len(condition.components) == 3
                 one_sided = len({0, 1} & set(condition.components)) == 1
                 off = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
                 why = "is held along x or y alone" if one_sided else "is held off the axis" if off else None
                 reason = why and f"boundary.{name}: {why}"
             parts.append(Leaves(reason, mirrors=partial(self._mirrored, context, name)))
-        if not fixed:  # a meridian asks for itself whether it is held
+        if not self.fixes:  # a meridian asks for itself whether it is held
             parts.append(Leaves(mirrors=nothing))
         return parts
 

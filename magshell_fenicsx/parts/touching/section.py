@@ -9,7 +9,7 @@ from pydantic import Field
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, nothing
+from magshell_fenicsx.shape.symmetry import Leaves, everything, nothing
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -69,8 +69,10 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
-        return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)]
+        """Planes of both shells of each pair, where a place and the nearest of the other shell are on one side; none of a
+        shell that may touch itself, for it may touch its own mirror image."""
+        mirrors = nothing if _touch_themselves(self.given, [*(context.sections.get("shells") or {})]) else everything
+        return [Leaves("contact: shells that may touch are modelled with their circumference", mirrors=mirrors)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
@@ -151,7 +153,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface", "the same thickness everywhere", "a thickness that does not change")
-    if symmetry in ("half", "axisymmetric"):
+    if symmetry == "axisymmetric" or (symmetry == "half" and _touch_themselves(given, shells)):
         raise ValueError(
             f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "
             "it between edges with boundary: symmetry"
@@ -160,6 +162,15 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
         _refuse_step(step, context)
     if context.sections.get("gradients"):
         raise ValueError("gradients: of shells that may touch each other are not built: leave out contact or gradients")
+
+
+def _touch_themselves(given: Sequence[Sequence[str]], shells: Sequence[str]) -> bool:
+    """Whether a pair is not of two shells."""
+
+    def of(name: str) -> str | None:
+        return next((shell for shell in shells if f"{name}_".startswith(f"{shell}_")), None)
+
+    return any(None in (of(one), of(other)) or of(one) == of(other) for one, other in given)
 
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:

@@ -242,6 +242,8 @@ def _first(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
 
 def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
     scene = choice.scene(problem, near[0].comm)
+    if problem.given:  # several shells, which have no chart in common: nothing is carried between their meshes
+        return scene, by_path(scene)
     return scene, from_near(scene, *near)
 
 
@@ -255,7 +257,7 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     """The same degree on another mesh, with the error times `reduction`; None if no other mesh is possible."""
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
-    if scene.problem.axisymmetric or isinstance(scene.problem.shape, Grid):
+    if scene.problem.axisymmetric or scene.problem.given or isinstance(scene.problem.shape, Grid):
         change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
             change = max(change, LINES)

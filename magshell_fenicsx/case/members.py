@@ -1,0 +1,130 @@
+"""The meshes of several shells, whole or halved by a plane in which each of them is its own mirror image."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.assembly import Assembly, Member
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.shape.ground import Ground
+from magshell_fenicsx.shape.outline import ground_of
+from magshell_fenicsx.shape.symmetry import Vectors
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.case.shells import Part, Several
+
+Array = NDArray[np.float64]
+
+
+class Members:
+    """What an `Assembly` asks of several shells."""
+
+    def __init__(self, several: "Several") -> None:
+        self._several = several
+
+    def whole(self) -> list[Member]:
+        """All shells as they are; a message of one begins with its key."""
+        return [self._member(part, None) for part in self._several.parts]
+
+    def half(self, plane: Mirror) -> Assembly:
+        """The halves of all shells on the one side of a plane, which is one of `mirrors`."""
+        whole, parts = self._several.assembly, self._several.parts
+
+        def halves() -> list[Member]:
+            return [self._member(part, self._own(part, plane)) for part in parts]
+
+        return replace(whole, digest=f"{whole.digest} {plane.plane.tolist()}", members=halves, halved=True)
+
+    def mirrors(self, vectors: Vectors, loosely: bool) -> list[Mirror]:
+        """The planes in which each shell is its own image, as those of the halves on both of their sides.
+
+        Parameters
+        ----------
+        vectors, loosely
+            See `Outline.mirrors`.
+        """
+        found = list[Mirror]()
+        if not self._held:
+            return found
+        for plane in self._candidates(vectors, loosely):
+            for side in (plane, plane.reversed):
+                kept = [self._kept(part, side, loosely) for part in self._several.parts]
+                if all(kept) and not any(_same(side, other) for other in found):
+                    named = zip(self._several.parts, kept, strict=True)
+                    lost = {f"{p.name}_{a}": f"{p.name}_{b}" for p, own in named if own for a, b in own.lost.items()}
+                    found.append(replace(side, lost=lost))
+        return found
+
+    def _member(self, part: "Part", plane: Mirror | None) -> Member:
+        """A shell, or its half at a plane in its own frame: that of its mesh is turned into the plane."""
+        from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
+
+        try:
+            problem = make_problem(part.case, plane=plane)
+            if problem.awaited:
+                raise CaseError("shell.imperfections: kind: modes: is of a shell alone: take another kind")
+            patch = problem.triangulated()
+        except (CaseError, MeshError) as e:
+            raise type(e)(part.refused(str(e))) from None
+        place = self._several.place(part)
+        turned = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
+        return Member(part.name, patch, turned, tuple(part.section.points))
+
+    def _own(self, part: "Part", plane: Mirror) -> Mirror:
+        """A plane in the frame of a shell and over its own length, with its edges that are lost."""
+        place, start = self._several.place(part), f"{part.name}_"
+        own = Mirror.of(place.Q.T @ plane.normal, (plane.offset - plane.normal @ place.position) / place.scale)
+        lost = {a.removeprefix(start): b.removeprefix(start) for a, b in plane.lost.items() if a.startswith(start)}
+        return replace(own, offset=0.0 if abs(own.offset) < ROUNDING else own.offset, lost=lost)
+
+    def _kept(self, part: "Part", plane: Mirror, loosely: bool) -> Mirror | None:
+        """The plane in the frame of a shell that is its own image in it; else None."""
+        from magshell_fenicsx.case.planner import kept  # the solver takes long to import
+
+        return kept(part.case, self._own(part, plane), loosely=loosely)
+
+    def _candidates(self, vectors: Vectors, loosely: bool) -> Iterator[Mirror]:
+        """Planes that some shell has: upright ones through axes of revolution, and those of its outline."""
+        places = [self._several.place(part) for part in self._several.parts]
+        grounds = zip(places, self._grounds, strict=True)
+        axes = [(place.position, place.Q[:, 2]) for place, ground in grounds if ground.perfect.round]
+        for at, axis in axes:
+            apart = [other - at for other, _ in axes]
+            for along in (*vectors, *apart, np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]):
+                normal = np.cross(axis, along)
+                if np.linalg.norm(normal) > ROUNDING:
+                    unit = Mirror.of(normal).normal
+                    yield Mirror(unit, _rounded(float(unit @ at)))
+        for place, ground in zip(places, self._grounds, strict=True):
+            for own in ground.perfect.mirrors([place.Q.T @ v for v in vectors], loosely):
+                normal = Mirror.of(place.Q @ own.normal).normal
+                yield Mirror(normal, _rounded(place.scale * own.offset + float(normal @ place.position)))
+
+    @cached_property
+    def _grounds(self) -> Sequence[Ground]:
+        return [ground_of(part.case.shell) for part in self._several.parts]
+
+    @property
+    def _held(self) -> bool:
+        """Whether each shell, or one that is joined to it, is held: halves do not see motions across their plane."""
+        held = {part.name: part.section.boundary.fixes for part in self._several.parts}
+        pairs = [tuple(self._several.of(name) for name in edges) for edges in self._several.joints]
+        for _ in pairs:
+            for one, other in pairs:
+                if one in held and other in held:
+                    held[one] = held[other] = held[one] or held[other]
+        return all(held.values())
+
+
+def _same(one: Mirror, other: Mirror) -> bool:
+    return bool(np.abs(one.normal - other.normal).max() < ROUNDING and abs(one.offset - other.offset) < ROUNDING)
+
+
+def _rounded(offset: float) -> float:
+    return 0.0 if abs(offset) < ROUNDING else offset
