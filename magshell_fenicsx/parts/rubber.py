@@ -44,11 +44,6 @@ class Rubber(Ability):
     def of(cls, context: Context) -> "Rubber | None":
         return None if context.shell.rubber is None else cls(context.shell.law)
 
-    def refuse_unfit(self, context: Context) -> None:
-        """A solid has one law."""
-        if self.law != "neo-hookean":
-            context.needs(f"shell.law: {self.law}", "a mid-surface", hint="a solid is neo-Hookean")
-
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Rubber keeps its volume."""
         return {"a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"}

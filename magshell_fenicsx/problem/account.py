@@ -90,4 +90,7 @@ def _elastic(body: Body) -> str:
     material, count = body.material, len(body.layers) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
-    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
+    law, share = "neo-Hookean energy", material.share
+    if share:
+        law = f"Mooney-Rivlin energy, C01/C10 = {share / (1 - share):.5g}"
+    return f"{law}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
