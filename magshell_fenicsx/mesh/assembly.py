@@ -105,6 +105,8 @@ class Assembly:
         Name of a shell -> its thickness over that of the first; None where it varies.
     moduli
         Name of a shell -> its Young's modulus over that of the first.
+    laws
+        Name of a shell -> the word for its law.
     home
         None: no program gave a mesh.
     """
@@ -114,6 +116,7 @@ class Assembly:
     joints: Sequence[tuple[str, str]] = ()
     thicknesses: Mapping[str, float | None] = field(default_factory=dict)
     moduli: Mapping[str, float] = field(default_factory=dict)
+    laws: Mapping[str, str] = field(default_factory=dict)
     home: None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Assembly":

@@ -19,7 +19,8 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
-EVERYWHERE = {"distortion", "areal distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
+DISTORTIONS = {"distortion", "areal distortion"}
+EVERYWHERE = {*DISTORTIONS, "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
 AT_ENDS = {"pressure whole", "pressure upper", "load moment rim 0"}
 FIELD = Magnetisation(
     np.array([0.6, 0.0, 0.8]),
