@@ -69,8 +69,9 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None
     """
     case = case.with_terms([*case.own_terms, *terms]) if terms else case
     terms = case.own_terms
-    of_shells = case.several.materials if case.several else None
-    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber, shells=of_shells)
+    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
+    if several := case.several:
+        material = replace(material, shells=several.materials, laws=several.laws, laminates=several.laminates)
     ground = ground_of(case.shell)
     perfect = ground.perfect
     imperfections = flaws(case.imperfections, ground)

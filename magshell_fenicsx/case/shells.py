@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +21,7 @@ from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section,
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Place
 from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.ground import Coordinates
@@ -28,6 +29,8 @@ from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.models.shell.laminate import Laminate
+    from magshell_fenicsx.models.shell.law import Law
     from magshell_fenicsx.models.shell.parameters import OwnMaterial
     from magshell_fenicsx.models.shell.thickness import Thickness
 
@@ -36,7 +39,8 @@ Keys = dict[str, Any]
 INSTEAD_OF = ("shell", "boundary", "points")
 OF_NAMES = ("loading", "contact", "joints", "natural", "magnetic")  # sections that name edges, points and patches
 FILES = ("file", "program")  # their values are no such names
-IN_COMMON = ("law", "mooney", "viscosity", "relaxation")
+IN_COMMON = ("viscosity", "relaxation")
+OF_FIRST = ("law", "mooney", *IN_COMMON)
 MOST_UNLIKE = 1e6  # a modulus or a density over that of the first shell, or the other way round
 SHOWN = ("at", "patch", "depth")  # keys of a force that mesh sizes follow
 NAME = re.compile(r"[A-Za-z]\w*")
@@ -140,10 +144,10 @@ class Several:
         """All of them as one mesh."""
         materials = self.materials or {}
         moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
+        laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
         members = Members(self)
-        return Assembly(
-            self.digest, members.whole, self.joints, self._thicknesses, moduli, members.mirrors, members.half
-        )
+        of_shells = self.joints, self._thicknesses, moduli, laws
+        return Assembly(self.digest, members.whole, *of_shells, members.mirrors, members.half)
 
     def of(self, name: str) -> str:
         """The shell of an edge, or itself."""
@@ -171,20 +175,46 @@ class Several:
         from magshell_fenicsx.models.shell.parameters import OwnMaterial
 
         first, own = self.parts[0].case.shell, dict[str, OwnMaterial]()
+        laws = list(self.laws)
         for part in self.parts:
             shell, keys = part.case.shell, ("modulus", "density")
             E, rho = ((getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys)
-            own[part.name] = OwnMaterial(E, shell.poisson_ratio, rho)
+            own[part.name] = OwnMaterial(E, shell.poisson_ratio, rho, laws.index(self._law(part)))
         return None if len({*own.values()}) == 1 else own
+
+    @cached_property
+    def laws(self) -> "tuple[Law, ...]":
+        """The different ones, that of the first shell at first."""
+        return tuple(dict.fromkeys(self._law(part) for part in self.parts))
+
+    def _law(self, part: Part) -> "Law":
+        """That of a shell, with Poisson's ratio of the first one, which `materials` replace."""
+        from magshell_fenicsx.models.shell.parameters import Material
+
+        first = self.parts[0].case.shell
+        laminate = self.laminates.get(part.name)
+        return Material(first.poisson_ratio, 1 / first.R_over_h, part.case.shell.rubber, laminate).law
+
+    @cached_property
+    def laminates(self) -> "dict[str, Laminate]":
+        """Name of a shell -> its plies, where it is."""
+        found: dict[str, Laminate] = {}
+        for part in self.parts:
+            if laminate := laminate_of(part.case.shell, 0.0):
+                place = self.place(part)
+                found[part.name] = replace(laminate, axes=place.Q, origin=place.position)
+        return found
 
     @property
     def told(self) -> list[str]:
         """What `check` says of the scales."""
         lines = [f"scales: R, h, E, nu and the density are those of the shell {self.parts[0].name}"]
+        words = self.assembly.laws
         for part in self.parts[1:]:
             said = f"h {self.ratio(part):.4g} times" + ("" if part.case.thickness_factor is None else " its factor")
             if own := (self.materials or {}).get(part.name):
                 said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}, density {own.density:.4g} times"
+            said += f", law: {words[part.name]}" if len({*words.values()}) > 1 else ""
             lines.append(f"  {part.name}: {said}")
         return lines
 
@@ -325,8 +355,6 @@ def _merged(parts: Sequence[Part]) -> Keys:
                     f"shell: lengths of {one} have units and those of {none} none: give all of them one, or none"
                 )
             )
-        if other.laminate:
-            raise ValueError(part.refused("shell.laminate: is of one shell alone: leave it out"))
         if isinstance(other.thickness_factor, GivenField):
             raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
         if isinstance(other, ShellSection) and not other.with_units and other.youngs_modulus is not None:
@@ -336,7 +364,7 @@ def _merged(parts: Sequence[Part]) -> Keys:
                 raise ValueError(
                     part.refused(
                         f"shell.{key}: is another than that of {first.name}: several shells have it in common; their "
-                        "youngs_modulus, poisson_ratio and density are their own"
+                        "law, youngs_modulus, poisson_ratio and density are their own"
                     )
                 )
         for key, name in (("modulus", "youngs_modulus"), ("density", "density")):
@@ -362,7 +390,7 @@ def _merged(parts: Sequence[Part]) -> Keys:
         of_first["youngs_modulus"] = unit(shell.modulus, "Pa")
     if shell.density is not None:
         of_first["density"] = unit(shell.density, "kg/m**3")
-    written = {key: getattr(shell, key) for key in IN_COMMON if key in shell.model_fields_set}
+    written = {key: getattr(shell, key) for key in OF_FIRST if key in shell.model_fields_set}
     return of_first | written
 
 

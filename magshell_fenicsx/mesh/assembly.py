@@ -106,6 +106,8 @@ class Assembly:
         Name of a shell -> its thickness over that of the first; None where it varies.
     moduli
         Name of a shell -> its Young's modulus over that of the first.
+    laws
+        Name of a shell -> the word for its law.
     mirrors
         Planes in which each shell is its own image, see `Outline.mirrors`.
     half
@@ -121,6 +123,7 @@ class Assembly:
     joints: Sequence[tuple[str, str]] = ()
     thicknesses: Mapping[str, float | None] = field(default_factory=dict)
     moduli: Mapping[str, float] = field(default_factory=dict)
+    laws: Mapping[str, str] = field(default_factory=dict)
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)
     half: Callable[[Mirror], "Assembly"] | None = field(default=None, repr=False)
     halved: bool = False

@@ -36,14 +36,15 @@ class Grown(Protocol):
         ...
 
 
-def thinned(r0: Jet, u: Jet, natural: Forms | None = None) -> Expr:
-    """The deformed thickness over the undeformed one: undeformed, or natural, over deformed area."""
+def thinned(r0: Jet, u: Jet, natural: Forms | None = None, thins: Expr | int = 1) -> Expr:
+    """The deformed thickness over the undeformed one: where `thins` is 1 undeformed, or natural, over deformed area."""
     stretch = kin.area_ratio(r0) / kin.area_ratio(r0 + u)
-    return stretch if natural is None else stretch * natural.area * natural.thickness
+    stretch = stretch if natural is None else stretch * natural.area * natural.thickness
+    return 1 + thins * (stretch - 1)
 
 
-def thinning(carrier: Carrier, u: fem.Function, natural: Grown | None) -> Thinning:
-    """The same at points, at the present displacement and natural shape."""
+def thinning(carrier: Carrier, u: fem.Function, natural: Grown | None, thins: Array | int = 1) -> Thinning:
+    """The same at points, at the present displacement and natural shape; `thins` of each cell (cells, 1)."""
     r0, V = carrier.r0, u.function_space
     by = natural.values if natural else None
 
@@ -54,7 +55,7 @@ def thinning(carrier: Carrier, u: fem.Function, natural: Grown | None) -> Thinni
             first = jets_of(r0.x.array)[1:3]
             area0, area = (np.linalg.norm(np.cross(*a), axis=-1) for a in (first, first + jets_of(u.x.array)[1:3]))
             factor = natural.volume(first, points) if natural and by else 1.0
-            return np.asarray(factor * area0 / area).ravel()
+            return np.asarray(1 + thins * (factor * area0 / area - 1)).ravel()
 
         return Follows(values, lambda: (r0.x.array, u.x.array, *(by or ())))
 

@@ -42,16 +42,19 @@ class Rubber(Ability):
 
     @classmethod
     def of(cls, context: Context) -> "Rubber | None":
-        return None if context.shell.rubber is None else cls(context.shell.law)
-
-    def refuse_unfit(self, context: Context) -> None:
-        """A solid has one law."""
-        if self.law != "neo-hookean":
-            context.needs(f"shell.law: {self.law}", "a mid-surface", hint="a solid is neo-Hookean")
+        """The first of several shells that is of rubber."""
+        laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
+        return next((cls(law) for law in laws), None)
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Rubber keeps its volume."""
         return {"a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"}
+
+
+def laws_of(context: Context) -> list[str]:
+    """The words for the laws of all shells."""
+    several = getattr(context.shell, "assembly", None)  # of a mesh in pieces alone
+    return [*several.laws.values()] if several else [context.shell.law]
 
 
 def law_account(rubber: float | None) -> str:

@@ -9,7 +9,7 @@ from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
-from magshell_fenicsx.parts.rubber import law_account
+from magshell_fenicsx.parts.rubber import law_account, laws_of
 from magshell_fenicsx.problem.problem import Body, body_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
@@ -82,7 +82,9 @@ def _imperfections(context: Context, rims: int) -> str:
 
 
 def _of_shell(context: Context) -> str:
-    laminate = context.shell.laminate
+    laminate, laws = context.shell.laminate, laws_of(context)
+    if {*laws} - {context.shell.law}:
+        return f"membrane and bending energy, each of its own law: {', '.join(laws)}"
     return laminate_account(laminate, context.shell) if laminate else law_account(context.shell.rubber)
 
 
@@ -90,4 +92,7 @@ def _elastic(body: Body) -> str:
     material, count = body.material, len(body.layers) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
-    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
+    law, share = "neo-Hookean energy", material.share
+    if share:
+        law = f"Mooney-Rivlin energy, C01/C10 = {share / (1 - share):.5g}"
+    return f"{law}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"

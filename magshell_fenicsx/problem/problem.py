@@ -23,7 +23,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.loads import Loads
@@ -43,7 +43,7 @@ PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a conta
 class Body:
     """The material of a solid, and where its elements through the thickness begin and end, 0 inside to 1 outside."""
 
-    material: NeoHookean
+    material: MooneyRivlin
     layers: list[float]
 
 
@@ -51,8 +51,8 @@ def body_of(context: Context) -> Body | None:
     """The solid of a case; None of a shell."""
     if not context.solid:
         return None
-    ratio = _section(context).bulk_to_shear
-    return Body(NeoHookean.of(context.shell.poisson_ratio, ratio), layers(context))
+    shell, ratio = context.shell, _section(context).bulk_to_shear
+    return Body(MooneyRivlin.of(shell.poisson_ratio, ratio, shell.rubber or 0.0), layers(context))
 
 
 def layers(context: Context) -> list[float]:

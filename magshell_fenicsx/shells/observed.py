@@ -20,6 +20,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.fitted import Cells
+from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.bodies.contact import Pressing, Region
 from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
@@ -96,6 +97,11 @@ class Observed:
     def kept(self) -> dict[type, Any]:
         """What rooms of parts keep with the model, by its class."""
         return {}
+
+    @property
+    def law_of_cells(self) -> Law:
+        """That of each cell of this rank, for arrays (cells, n) of places in them."""
+        return self.material.law
 
     @property
     def mirrored_facets(self) -> Facets:
@@ -232,6 +238,10 @@ class Thin(Observed):
     def carrier(self) -> Carrier:
         """Where its densities are integrated."""
         return self.factory.carrier
+
+    @property
+    def law_of_cells(self) -> Law:
+        return self.factory.law_of_cells
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """The integral over the undeformed area of what is modelled."""

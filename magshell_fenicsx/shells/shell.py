@@ -132,8 +132,9 @@ class ShellModel(Thin):
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         in_cells = cells_of(self.r0)
-        if material.laminate:
-            material.laminate.refuse_normal(places(self.r0)[1], midsurface.mesh.comm)
+        for name, laminate in material.every_laminate.items():
+            cells = midsurface.patches[name] if name else slice(None)
+            laminate.refuse_normal(places(self.r0)[1][cells], midsurface.mesh.comm)
         for name in ("magnetic", "remanence"):
             if (field := getattr(loads, name)) and field.given:
                 vectors = carried(field.given, midsurface, in_cells)
@@ -196,7 +197,8 @@ class ShellModel(Thin):
                 continue
             if condition == "plane":
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
-                if material.laminate and not material.laminate.mirrored(plane):
+                plies = (each for of, each in material.every_laminate.items() if not of or name.startswith(f"{of}_"))
+                if not all(laminate.mirrored(plane) for laminate in plies):
                     raise MeshError(
                         f"boundary: {name}: its plane does not mirror the plies, which are neither along nor across it"
                     )

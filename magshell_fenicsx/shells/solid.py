@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.loads import Loads, moments, potentials
@@ -83,14 +83,14 @@ class SolidModel(Observed):
         self,
         body: Body,
         material: Material,
-        neo_hookean: NeoHookean,
+        law: MooneyRivlin,
         conditions: Mapping[str, Condition],
         loads: Loads,
         mirror: Mirror = Y0,
     ) -> None:
         if loads.magnetic:
             loads = replace(loads, magnetic=_in_cells(loads.magnetic, body))
-        self.body, self.material, self.neo_hookean = body, material, neo_hookean
+        self.body, self.material, self.law = body, material, law
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
@@ -108,16 +108,16 @@ class SolidModel(Observed):
             shape = body_shape(loads.natural, body, V, free)
             growing["grown"] = lambda density: grown_in_body(density, shape)
         self.factory = factory = TermFactory(
-            body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, fields=[], **growing
+            body, self.u, law, material.h, self.kernels, hinged, free=free, fields=[], **growing
         )
-        self._pattern = factory.distortion()
+        self._pattern, *areal = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
         free_ends, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
         closed = enclosed(loads, free_ends, self.without_potential)
         swept = loads.pressure or closed
-        self._terms: list[Term] = [self._pattern, factory.compression()]
+        self._terms: list[Term] = [self._pattern, *areal, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:

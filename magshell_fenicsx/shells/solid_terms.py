@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.patterns import (
     shown,
 )
 from magshell_fenicsx.models.solid import densities
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
@@ -94,7 +94,7 @@ class TermFactory:
 
     body: Body
     u: fem.Function
-    material: NeoHookean
+    material: MooneyRivlin
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
@@ -102,9 +102,15 @@ class TermFactory:
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
 
-    def distortion(self) -> SolidTerm:
-        density = Density(densities.distortion, self._constants(self.material.shear, self.h))
-        return self._bulk("distortion", self.grown(density))
+    def distortions(self) -> list[SolidTerm]:
+        """What does not depend on a change of volume; of a neo-Hookean body one term."""
+        shear, share = self.material.shear, self.material.share
+        of = {"distortion": (densities.distortion, 1 - share), "areal distortion": (densities.areal_distortion, share)}
+        return [
+            self._bulk(name, self.grown(Density(density, self._constants(part * shear, self.h))), group="distortion")
+            for name, (density, part) in of.items()
+            if part or name == "distortion"
+        ]
 
     def compression(self) -> SolidTerm:
         """With two quadrature points in each direction: more constraints on J than that would lock the element.

@@ -258,7 +258,7 @@ def tees(model: "ShellModel") -> list[Tee]:
         t = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
         factors *= np.column_stack([t, t**3])
     if model.made_of is not None:
-        factors *= model.made_of.x.array.reshape(-1, 3)[model.made_of.function_space.dofmap.list[:, 0], :1]
+        factors *= model.made_of.x.array.reshape(-1, 4)[model.made_of.function_space.dofmap.list[:, 0], :1]
     return [
         Tee(
             joint,

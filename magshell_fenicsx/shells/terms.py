@@ -1,8 +1,8 @@
 """The energies of a shell on its carrier: each a density, made only when a scene calls for it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import ufl
@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.energy import (
     per_area,
 )
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
-from magshell_fenicsx.models.shell.law import elastic
+from magshell_fenicsx.models.shell.law import Law, OfShells, elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
@@ -221,7 +221,7 @@ class EnergyFactory:
 
     def remanent(self, field: Magnetisation, known: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
-        pattern, carrier, thins = field.remanent, self.carrier, self.material.law.thins
+        pattern, carrier, thins = field.remanent, self.carrier, self.material.law.some_thin
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
         if known:
@@ -253,8 +253,8 @@ class EnergyFactory:
     ) -> Density:
         """A density of the remanence with the thickness and, if that thins with F, the natural shape."""
         density = Density(per_area(of), parameters, parts=parts)
-        thins = self.material.law.thins and field.law == "deformation"
-        return self._thick(grown(density, self.natural) if thins and self.natural else density)
+        thins = self.material.law.some_thin and field.law == "deformation"
+        return self._thick(self._thinning(density) if thins else density)
 
     def pressure(self, *, potential: bool) -> Energy:
         """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
@@ -303,12 +303,12 @@ class EnergyFactory:
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
         carrier, approach = self.carrier, self.free.setdefault(contact.amplitude, self._constant(0.0))
-        rule, thins = carrier.contact_rule, self.material.law.thins
-        thins_at = thinning(carrier, self.u, self.natural) if thins else None
+        rule, thins = carrier.contact_rule, self.material.law.some_thin
+        thins_at = thinning(carrier, self.u, self.natural, self.law_of_cells.thins) if thins else None
         known = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at)
         of, parts = (thinned_energy, MOVED) if thins else (contact_energy, ("r",))
         density = Density(per_area(of), known.parameters, parts, quadrature=rule)
-        density = grown(density, self.natural) if thins and self.natural else density
+        density = self._thinning(density) if thins else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
         by_name = {name: Density(per_area(of), known.parameters, quadrature=rule) for name, of in seen.items()}
@@ -330,6 +330,25 @@ class EnergyFactory:
     def _thick(self, density: Density) -> Density:
         """The density over E h with the thickness as it varies, if it does."""
         return density if self.thickness is None else thick(density, self.thickness)
+
+    def _thinning(self, density: Density) -> Density:
+        """A density of what thins, on the natural shape, and where the law of the shell says so."""
+        law, own = self.material.law, self.made_of
+        density = grown(density, self.natural) if self.natural else density
+        if own is None or not isinstance(law, OfShells):
+            return density
+
+        def of(*arguments: Expr, **keywords: Any) -> Expr:
+            *given, numbers = arguments
+            return density.of(*given, thins=law.made_of(numbers[0], numbers[1], numbers[3]).thins, **keywords)
+
+        return replace(density, of=of, parameters=(*density.parameters, own))
+
+    @property
+    def law_of_cells(self) -> Law:
+        """That of each cell of this rank, for arrays (cells, n) of places in them."""
+        own = self.made_of
+        return self.material.law_in(own and own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[:, 0]])
 
     def _weighty(self, density: Density) -> Density:
         """One of what has mass, with thickness and density of the material as they vary, if they do."""

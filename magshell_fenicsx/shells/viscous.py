@@ -319,7 +319,7 @@ def _works(model: ShellModel | MeridianModel, given: _Given | _Rates) -> list[uf
         """That of the shell at small strains, which a viscous stress follows too."""
         of_shell, own = densities.law_at(model.material.law.linear, j), factory.made_of
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
-        return of_shell if own is None else of_shell.made_of(*((own(side) if side else own)[i] for i in range(2)))
+        return of_shell if own is None else of_shell.made_of(*((own(side) if side else own)[i] for i in (0, 1, 3)))
 
     E, K = _strained(r0, u)
     strain, bend = given.strain(r0, "")

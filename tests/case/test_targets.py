@@ -38,6 +38,15 @@ def test_sizes(loading: dict[str, Any], key: str, size: float) -> None:
     assert getattr(step.load, key) == pytest.approx(size, rel=1e-12)
 
 
+def test_a_gas() -> None:
+    """Its volume in litres over R^3."""
+    gas = {"ambient": "100 kPa", "volume": "0.03 l"}
+    _, step = case(
+        [{"kind": "pressure", "control": "load"}, {**PATCH, "depth": 1, "hold": {"pressure": {"gas": gas}}}]
+    ).programme
+    assert step.load.hold["pressure"].gas.volume == pytest.approx(3e-5 / R**3, rel=1e-12)
+
+
 def test_mistakes() -> None:
     """Another dimension; a shell without units; numbers stay numbers, and bounds hold for both."""
     with pytest.raises(CaseError, match=r"loading\.depth: '2 s': is not convertible to millimetre"):

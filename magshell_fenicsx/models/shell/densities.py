@@ -72,13 +72,16 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
 
 
-def magnetic_thinned(r0: Jet, u: Jet, Br: Expr, Ba: Expr, *, natural: Forms | None = None) -> Expr:
-    """That of a volume that stays: n (x) n0 in F has the stretch of the thickness, of the `natural` volume."""
+def magnetic_thinned(
+    r0: Jet, u: Jet, Br: Expr, Ba: Expr, *, natural: Forms | None = None, thins: Expr | int = 1
+) -> Expr:
+    """That of a volume that stays where `thins` is 1: n (x) n0 in F has the stretch of the thickness, of the `natural`
+    volume."""
     r, n0 = r0 + u, kin.normal(r0)
     thinned = kin.area_ratio(r0) / kin.area_ratio(r)
     if natural is not None:
         thinned *= natural.area * natural.thickness
-    return magnetic(r0, u, Br, Ba) - (thinned - 1) * ufl.dot(Ba, kin.normal(r)) * ufl.dot(n0, Br)
+    return magnetic(r0, u, Br, Ba) - thins * (thinned - 1) * ufl.dot(Ba, kin.normal(r)) * ufl.dot(n0, Br)
 
 
 def in_gradient(law: MagneticDensity) -> MagneticDensity:

@@ -24,11 +24,25 @@ Stiffness: TypeAlias = Any  # 11, 12, 22, 16, 26, 66: numbers, or an expression 
 
 @dataclass(frozen=True)
 class Laminate:
-    """What a model needs of the plies: A, B, D (3, 6) and the direction of the angle 0, in the model's frame."""
+    """What a model needs of the plies.
+
+    Attributes
+    ----------
+    matrices
+        A, B, D (3, 6).
+    direction
+        Of the angle 0 in the shell's frame; None for the meridians of its e3.
+    isotropic
+        Whether all directions are alike.
+    axes, origin
+        The shell's frame in that of the model: (3, 3) whose columns are its axes, and (3,).
+    """
 
     matrices: Array = field(repr=False)
     direction: Array | None
     isotropic: bool = False
+    axes: Array = field(default_factory=lambda: np.eye(3), repr=False)
+    origin: Array = field(default_factory=lambda: np.zeros(3), repr=False)
 
     def refuse_normal(self, normals: Array, comm: MPI.Comm) -> None:
         """See that the direction has a part in each cell, whose normals are (cells, nodes, 3); collective.
@@ -40,7 +54,8 @@ class Laminate:
         """
         if self.direction is None or self.isotropic:
             return
-        within = np.linalg.norm(np.cross(normals, self.direction / np.linalg.norm(self.direction)), axis=-1)
+        unit = self.axes @ self.direction / np.linalg.norm(self.direction)
+        within = np.linalg.norm(np.cross(normals, unit), axis=-1)
         if comm.allreduce(float(within.max(axis=1).min(initial=1.0)), MPI.MIN) < SAME:
             raise MeshError(
                 "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no direction"
@@ -48,7 +63,8 @@ class Laminate:
 
     def mirrored(self, plane: Mirror) -> bool:
         """Whether a plane mirrors plies that do not twist: it is along or across their directions everywhere."""
-        return self.isotropic or plane.keeps_lines(self.direction)
+        own = replace(plane, normal=plane.normal @ self.axes, offset=plane.offset - float(plane.normal @ self.origin))
+        return self.isotropic or own.keeps_lines(self.direction)
 
 
 @dataclass(frozen=True)
@@ -60,9 +76,11 @@ class Laminated(Law):
     A, B, D
         Over E h, E h^2 and E h^3.
     axis
-        The vector (3,) along whose part in the surface the angle 0 is; of meridians it does not count.
+        The vector (3,) along whose part in the surface the angle 0 is, or whose meridians it is along.
+    origin
+        A place (3,) on the axis of meridians.
     meridian
-        Whether the angle 0 is along the meridians of e3 in place of `axis`.
+        Whether the angle 0 is along the meridians of `axis`.
     direction
         Components, with index down, of the angle 0 at a point, of any length; see `at`.
     """
@@ -71,6 +89,7 @@ class Laminated(Law):
     B: Stiffness = field(default=(), kw_only=True)
     D: Stiffness = field(default=(), kw_only=True)
     axis: Any = field(default=(1.0, 0.0, 0.0), kw_only=True)
+    origin: Any = field(default=(0.0, 0.0, 0.0), kw_only=True)
     meridian: bool = field(default=False, kw_only=True)
     direction: tuple[Scalar, Scalar] = field(default=(1.0, 0.0), kw_only=True)
 
@@ -78,16 +97,17 @@ class Laminated(Law):
     def of(cls, laminate: Laminate, h: float, nu: float) -> Self:
         """That of plies."""
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
-        meridian = laminate.direction is None
-        axis = (0.0, 0.0, 1.0) if laminate.direction is None else tuple(float(v) for v in laminate.direction)
-        return cls(h, nu, A=A, B=B, D=D, axis=axis, meridian=meridian)
+        along, meridian = laminate.direction, laminate.direction is None
+        turned = laminate.axes @ (np.eye(3)[2] if along is None else along)
+        axis, origin = (tuple(float(c) for c in v) for v in (turned, laminate.origin))
+        return cls(h, nu, A=A, B=B, D=D, axis=axis, origin=origin, meridian=meridian)
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        return self.h, self.number, self.A, self.B, self.D, self.axis
+        return self.h, self.number, self.A, self.B, self.D, self.axis, self.origin
 
     def with_numbers(self, *numbers: Any) -> Self:
-        names = "h", "number", "A", "B", "D", "axis"
+        names = "h", "number", "A", "B", "D", "axis", "origin"
         return replace(self, t=1, e=1, **dict(zip(names, numbers, strict=True)))
 
     @property
@@ -95,12 +115,13 @@ class Laminated(Law):
         return self.meridian
 
     def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        axis = self.axis
+        def dot(v: Any, a: Any) -> Scalar:
+            return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
+
+        one, two = (dot(self.axis, a) for a in (a1, a2))
         if self.meridian:  # (e_theta x n) . a, times lengths
-            x, y, out = r[..., 0], r[..., 1], r[..., 0] * n[..., 0] + r[..., 1] * n[..., 1]
-            one, two = (n[..., 2] * (x * a[..., 0] + y * a[..., 1]) - out * a[..., 2] for a in (a1, a2))
-        else:
-            one, two = (axis[0] * a[..., 0] + axis[1] * a[..., 1] + axis[2] * a[..., 2] for a in (a1, a2))
+            x = [r[..., i] - self.origin[i] for i in range(3)]
+            one, two = (dot(self.axis, n) * dot(x, a) - dot(x, n) * along for a, along in ((a1, one), (a2, two)))
         return replace(self, direction=(one, two))
 
     @property

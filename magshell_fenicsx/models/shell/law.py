@@ -8,10 +8,12 @@ A further law is a `Law`, and a line in `parameters.Material.law`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Self, TypeAlias
 
+import numpy as np
+import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell.energy import Density, Parameter
@@ -36,7 +38,7 @@ class Law(ABC):
     e
         What multiplies Young's modulus.
     thins
-        Whether the thickness follows from the area, so that the volume stays.
+        1 where the thickness follows from the area, so that the volume stays; else 0.
     by_place
         Whether directions depend on the place itself.
     """
@@ -45,7 +47,15 @@ class Law(ABC):
     number: Scalar
     t: Scalar = 1
     e: Scalar = 1
-    thins: ClassVar[bool] = False
+
+    @property
+    def thins(self) -> Scalar:
+        return 0
+
+    @property
+    def some_thin(self) -> bool:
+        """Whether it does so anywhere."""
+        return bool(self.thins)
 
     @property
     def numbers(self) -> tuple[Any, ...]:
@@ -68,8 +78,9 @@ class Law(ABC):
         """That of a shell so many times as thick."""
         return replace(self, t=factor * self.t)
 
-    def made_of(self, e: Scalar, nu: Scalar) -> Self:
-        """The law with Young's modulus times e, and with another Poisson's ratio where the law has one."""
+    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+        """The law with Young's modulus times e, with another Poisson's ratio where the law has one, and of several laws
+        the one with this number."""
         return replace(self, e=e * self.e)
 
     @property
@@ -129,7 +140,7 @@ class Koiter(Law):
     def nu(self) -> Scalar:
         return self.number
 
-    def made_of(self, e: Scalar, nu: Scalar) -> "Koiter":
+    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> "Koiter":
         return replace(self, e=e * self.e, number=nu)
 
     @property
@@ -172,6 +183,96 @@ class Koiter(Law):
         return S11, S12, S22
 
 
+@dataclass(frozen=True)
+class OfShells(Law):
+    """Several shells, each with its own law; the first one's is that of the units.
+
+    Attributes
+    ----------
+    laws
+        At least two, with the same h.
+    which
+        The number of the law at a place.
+    """
+
+    laws: tuple[Law, ...] = field(default=(), kw_only=True)
+    which: Scalar = field(default=0, kw_only=True)
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        return tuple(number for law in self.laws for number in law.numbers)
+
+    def with_numbers(self, *numbers: Any) -> Self:
+        left, laws = list(numbers), list[Law]()
+        for law in self.laws:
+            count = len(law.numbers)
+            laws.append(law.with_numbers(*left[:count]))
+            del left[:count]
+        return replace(self, laws=tuple(laws))
+
+    @property
+    def thins(self) -> Scalar:
+        return self._there([law.thins for law in self.laws])
+
+    @property
+    def some_thin(self) -> bool:
+        return any(law.some_thin for law in self.laws)
+
+    @property
+    def by_place(self) -> bool:
+        return any(law.by_place for law in self.laws)
+
+    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+        return self._each(lambda law: law.at(r, a1, a2, n))
+
+    def thicker(self, factor: Scalar) -> Self:
+        return self._each(lambda law: law.thicker(factor))
+
+    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+        return replace(self._each(lambda law: law.made_of(e, nu)), which=which)
+
+    @property
+    def linear(self) -> "OfShells":
+        return self if all(law.linear is law for law in self.laws) else self._each(lambda law: law.linear)
+
+    @property
+    def bending_stiffness(self) -> Scalar:
+        return self.laws[0].bending_stiffness
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        return self._there([law.membrane(E, up) for law in self.laws])
+
+    def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        return self._there([law.bending(E, K, up) for law in self.laws])
+
+    def stress(self, E: Tensor, up: Tensor) -> Components:
+        S11, S12, S22 = map(self._there, zip(*(law.stress(E, up) for law in self.laws), strict=True))
+        return S11, S12, S22
+
+    def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        M11, M12, M22 = map(self._there, zip(*(law.moment(E, K, up) for law in self.laws), strict=True))
+        return M11, M12, M22
+
+    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        return self._there([law.edge_moment(E, K, up, across, square) for law in self.laws])
+
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        return self._there([law.edge_stiffness(E, up, across, square) for law in self.laws])
+
+    def _each(self, change: Callable[[Law], Law]) -> Self:
+        return replace(self, laws=tuple(change(law) for law in self.laws))
+
+    def _there(self, values: Sequence[Scalar]) -> Scalar:
+        """Of one value of each law that of the law at a place."""
+        found = values[0]
+        for i, value in enumerate(values[1:]):
+            if isinstance(self.which, Expr):
+                found = ufl.conditional(ufl.gt(self.which, i + 0.5), value, found)
+            else:
+                found = np.where(np.asarray(self.which) > i + 0.5, value, found)
+        return found
+
+
 def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """S^i_j as 11, 12, 21, 22."""
     S11, S12, S22 = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
@@ -199,8 +300,8 @@ def work(S: Components, T: Tensor) -> Scalar:
 def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None) -> Density:
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
-    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1. `made_of` (3,) begins with
-    the arguments of `Law.made_of`; None for one material.
+    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1. `made_of` (4,) is
+    `OwnMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
@@ -215,7 +316,7 @@ def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Par
         count = len(given) - len(law.numbers)
         laws = [law.with_numbers(*given[count:]).thicker(factor) for factor in factors]
         if materials is not None:
-            laws = [of_side.made_of(own[0], own[1]) for of_side, own in zip(laws, materials, strict=True)]
+            laws = [of_side.made_of(own[0], own[1], own[3]) for of_side, own in zip(laws, materials, strict=True)]
         return density.of(*given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords)
 
     fields = (field for field in (t, made_of) if field is not None)

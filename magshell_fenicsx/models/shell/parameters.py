@@ -1,7 +1,7 @@
 """What a shell is made of and what loads it, dimensionless."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
-from magshell_fenicsx.models.shell.law import Koiter, Law
+from magshell_fenicsx.models.shell.law import Koiter, Law, OfShells
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.models.shell.rubber import Rubber
@@ -28,27 +28,30 @@ Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] 
 
 @dataclass(frozen=True)
 class OwnMaterial:
-    """The material of one of several shells: modulus and density over those of the first shell, and Poisson's ratio.
+    """The material of one of several shells: modulus and density over those of the first shell, Poisson's ratio, and
+    the number of its law in `Material.laws`.
 
     >>> OwnMaterial(2.0, 0.3).numbers
-    (2.0, 0.3, 1.0)
+    (2.0, 0.3, 1.0, 0)
     """
 
     modulus: float
     nu: float
     density: float = 1.0
+    law: int = 0
 
     @property
-    def numbers(self) -> tuple[float, float, float]:
-        """`modulus`, `nu` and `density`, the components of `thickness.material_field`."""
-        return self.modulus, self.nu, self.density
+    def numbers(self) -> tuple[float, float, float, int]:
+        """`modulus`, `nu`, `density` and `law`, the components of `thickness.material_field`."""
+        return self.modulus, self.nu, self.density, self.law
 
 
 @dataclass(frozen=True)
 class Material:
     """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units.
 
-    `shells` are the materials of several shells by their names, of which the first has nu; None if all have one.
+    `shells` are the materials of several shells by their names, of which the first has nu; None if all have one. `laws`
+    are theirs, the first one's at first, and `laminates` the plies by names.
     """
 
     nu: float
@@ -56,13 +59,29 @@ class Material:
     rubber: float | None = None
     laminate: Laminate | None = None
     shells: Mapping[str, OwnMaterial] | None = None
+    laws: tuple[Law, ...] = ()
+    laminates: Mapping[str, Laminate] = field(default_factory=dict)
 
     @property
     def law(self) -> Law:
         """How a shell of it resists strains."""
+        if self.laws:
+            return OfShells(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
         if self.laminate:
             return Laminated.of(self.laminate, self.h, self.nu)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
+
+    @property
+    def every_laminate(self) -> dict[str, Laminate]:
+        """Name of a shell -> its plies; the name is empty where there is one."""
+        return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
+
+    def law_in(self, cells: NDArray[np.float64] | None) -> Law:
+        """That of cells with these `OwnMaterial.numbers` (cells, 4), for arrays (cells, n); None where all have one."""
+        if cells is None:
+            return self.law
+        e, nu, _, which = np.moveaxis(cells[:, None], -1, 0)
+        return self.law.made_of(e, nu, which)
 
     @property
     def bending_stiffness(self) -> float:

@@ -12,7 +12,6 @@ Of W'' a part that multiplies det K is changed by a factor that is 1 without str
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import ufl
 from ufl.core.expr import Expr
@@ -24,7 +23,9 @@ from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, T
 class Rubber(Law):
     """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
 
-    thins: ClassVar[bool] = True
+    @property
+    def thins(self) -> Scalar:
+        return 1
 
     @property
     def linear(self) -> Koiter:

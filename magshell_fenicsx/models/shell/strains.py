@@ -80,16 +80,16 @@ class TangentFrame:
         m, area = _area_vector(self.jet[:3] + u[:3])
         return np.asarray(m / area[..., None])
 
-    def convected(self, v: Array, u: Array, *, thins: bool = False) -> Array:
+    def convected(self, v: Array, u: Array, *, thins: Array | float = 0) -> Array:
         """F v with F = a_i (x) a0^i + s n (x) n0, of vectors (..., 3): how a remanence moves with the shell.
 
-        The stretch s of the thickness is 1, or that of a volume that stays.
+        The stretch s of the thickness is that of a volume that stays where `thins` is 1, else 1.
         """
         carried = self._carried(self._deformed(u), v, u)
-        if not thins:
+        if not np.any(thins):
             return carried
         m, area = _area_vector(self.jet[:3] + u[:3])
-        thinned = self.area / area - 1
+        thinned = thins * (self.area / area - 1)
         return np.asarray(carried + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:

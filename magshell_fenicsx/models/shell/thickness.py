@@ -116,13 +116,13 @@ def thickness_field(
 def material_field(
     shells: Mapping[str, OwnMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
 ) -> fem.Function:
-    """`OwnMaterial.numbers` of each cell; shape (3,).
+    """`OwnMaterial.numbers` of each cell; shape (4,).
 
     `patches` tell for each cell of this rank, ghosts too, whether it belongs to a shell.
     """
-    Q = fem.functionspace(domain, ("DG", 0, (3,)))
+    Q = fem.functionspace(domain, ("DG", 0, (4,)))
     field = fem.Function(Q, name="material")
-    values = field.x.array.reshape(-1, 3)
+    values = field.x.array.reshape(-1, 4)
     for name, own in shells.items():
         values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = own.numbers
     return field

@@ -1,4 +1,4 @@
-"""The compressible neo-Hookean solid that E and nu stand for: its energies as plain functions of point quantities.
+"""The compressible rubber that E and nu stand for as a solid: its energies as plain functions of point quantities.
 
 Energies are over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is the undeformed place,
 u the displacement and H its gradient by X; F = 1 + H. At an end, the face above an edge of the mid-surface, n is
@@ -20,6 +20,15 @@ def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | N
     if growth is not None:
         return ufl.det(growth) * distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)
     return shear / (2 * h) * (ufl.det(F) ** (-2 / 3) * ufl.inner(F, F) - 3)
+
+
+def areal_distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
+    """mu/2 (J^(-4/3) I2 - 3), I2 the second invariant of F^T F, as `distortion`."""
+    F = ufl.Identity(3) + H
+    if growth is not None:
+        return ufl.det(growth) * areal_distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)
+    C = ufl.dot(F.T, F)
+    return shear / (2 * h) * (ufl.det(F) ** (-4 / 3) * (ufl.tr(C) ** 2 - ufl.inner(C, C)) / 2 - 3)
 
 
 def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr, growth: Expr | None = None) -> Expr:
@@ -96,32 +105,34 @@ def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity
 
 
 @dataclass(frozen=True)
-class NeoHookean:
-    """W = mu/2 (J^(-2/3) F:F - 3) + kappa/2 (J - 1)^2, both moduli over Young's modulus.
+class MooneyRivlin:
+    """W = mu/2 [(1 - s) (J^(-2/3) I1 - 3) + s (J^(-4/3) I2 - 3)] + kappa/2 (J - 1)^2, moduli over Young's modulus.
 
-    The law of Zhao et al. (J. Mech. Phys. Solids 124, 2019), whose elements the paper takes.
+    s = C01/(C10 + C01) is the `share`; at 0 it is the neo-Hookean law of Zhao et al. (J. Mech. Phys. Solids 124, 2019),
+    whose elements the paper takes.
 
     Examples
     --------
-    >>> NeoHookean.of(0.0, 100.0)
-    NeoHookean(shear=0.5, bulk=0.3333333333333333)
-    >>> rubber = NeoHookean.of(0.5, 100.0)
+    >>> MooneyRivlin.of(0.0, 100.0)
+    MooneyRivlin(shear=0.5, bulk=0.3333333333333333, share=0.0)
+    >>> rubber = MooneyRivlin.of(0.5, 100.0)
     >>> round(rubber.bulk / rubber.shear, 9), round(rubber.youngs_modulus, 5), round(rubber.nu, 5)
     (100.0, 0.99668, 0.49502)
     """
 
     shear: float
     bulk: float
+    share: float = 0.0
 
     @classmethod
-    def of(cls, nu: float, bulk_to_shear: float) -> "NeoHookean":
+    def of(cls, nu: float, bulk_to_shear: float, share: float = 0.0) -> "MooneyRivlin":
         """With Young's modulus 1 for small strains.
 
         For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times that: both
         Young's modulus and nu then fall short of their limits, by 1/(3 bulk_to_shear).
         """
         shear = 1 / (2 * (1 + nu))
-        return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)))
+        return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)), share)
 
     @property
     def youngs_modulus(self) -> float:

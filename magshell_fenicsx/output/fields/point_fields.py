@@ -126,7 +126,7 @@ class Stresses:
     thickness
         (cells, points) factor of h; None for 1.
     made_of
-        (cells, 3) `parameters.OwnMaterial` of each cell; None for that of `material`.
+        (cells, 4) `parameters.OwnMaterial` of each cell; None for that of `material`.
     """
 
     def __init__(
@@ -139,8 +139,8 @@ class Stresses:
     ) -> None:
         self.frame = frame = TangentFrame.of(r0)
         self._thickness = thickness
-        self._law = material.law.at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
-        self._natural, self._made_of = natural and natural.at(r0[0], self.frame.n0), made_of
+        self._law = material.law_in(made_of).at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
+        self._natural, self._unit = natural and natural.at(r0[0], self.frame.n0), material.bending_stiffness
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
         """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
@@ -156,15 +156,13 @@ class Stresses:
         frame, total = self.frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
-        if self._made_of is not None:
-            law = law.made_of(self._made_of[:, :1], self._made_of[:, 1:2])
         if self._natural:
             total["E_total"] = E
             shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
             E, M = shape.elastic(E), shape.moment(E, K, law)
         else:
             M = bending_moment(E, K, law)
-        return {"E": E, "M": M / self._law.bending_stiffness, **total}
+        return {"E": E, "M": np.asarray(M / self._unit), **total}
 
 
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
@@ -186,14 +184,15 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
     sigma_1, sigma_2
         Force per deformed area of the middle layer, in the same directions.
     """
-    if not law.thins:
+    if not law.some_thin:
         return {}
     E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
     square = 1 + 2 * E
     S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
     stretches = [*np.sqrt(np.moveaxis(square, -1, 0)), 1 / np.sqrt(np.prod(square, axis=-1))]
     stretched = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
-    return stretched | {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
+    stretched |= {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
+    return {name: np.where(law.thins, values, np.nan) for name, values in stretched.items()}
 
 
 def in_space(S: Array, t: Array) -> Array:
@@ -223,6 +222,8 @@ class PointFields:
         What is magnetised if there is no field.
     natural
         The natural shape, whose volume stays.
+    made_of
+        As of `Stresses`.
 
     Attributes
     ----------
@@ -246,10 +247,11 @@ class PointFields:
         contacts: Sequence[Contact] = (),
         remanence: Magnetisation | None = None,
         natural: Natural | None = None,
+        made_of: Array | None = None,
     ) -> None:
-        self._contacts, self._h, self._thins = contacts, material.h, material.law.thins
+        self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
-        self._natural = natural.at(r0[0], self._frame.n0) if natural and contacts and self._thins else None
+        self._natural = natural.at(r0[0], self._frame.n0) if natural and contacts and np.any(self._thins) else None
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
@@ -306,14 +308,15 @@ class PointFields:
         """The deformed thickness over the undeformed one; see `parts.gap`."""
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
-        if self._natural is None:
-            return np.asarray(stretch)
-        shape = NaturalFrame.of(self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
-        return np.asarray(stretch * shape.thickness / np.linalg.det(shape.inverse))
+        if self._natural is not None:
+            shape = NaturalFrame.of(self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+            stretch = stretch * shape.thickness / np.linalg.det(shape.inverse)
+        return np.asarray(1 + self._thins * (stretch - 1))
 
     def _gap(self, u: Array, mu: Mapping[str, float]) -> Array:
         h, r = self._h, self._frame.jet[0] + u[0]
-        factor = (1.0 if self._thickness is None else self._thickness) * (self._thinned(u, mu) if self._thins else 1.0)
+        factor = 1.0 if self._thickness is None else self._thickness
+        factor = factor * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
         factor = np.broadcast_to(factor, r.shape[:-1]).ravel()
         gaps = [c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.models.shell.law import Law, OfShells
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
@@ -118,7 +119,7 @@ class SurfaceGatherer:
         r, inner = self._jet(model.r0, self._places), self._jet(model.r0, self._inner)
         thick, thick_inside = (self._thickness(at) for at in (self._places, self._inner))
         others = loads.contacts, loads.remanence, loads.natural
-        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
+        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others, self._made_of())
         self._stresses = Stresses(inner, model.material, thick_inside, loads.natural, self._made_of())
         self._six = six(self._stresses.frame)
         if numbers is not None:
@@ -139,6 +140,8 @@ class SurfaceGatherer:
         given = [fields.Br, fields.susceptibility, *(loads.natural.at(inside(r), fields.n0) if loads.natural else ())]
         thickness = self._thickness(self._places)
         given += [self._shell_of()] if self._model.midsurface.shells else []
+        if isinstance(self._model.material.law, OfShells) and (own := self._made_of()) is not None:
+            given.append(np.repeat(own[:, None, 3], r.shape[1], axis=1))
         given = [self._gathered(f) for f in (*given, *(() if thickness is None else (thickness,))) if f.size]
         r, n0, inner, weight = (
             self._gathered(f) for f in (r, fields.n0, inner, self._stresses.frame.area * self._rule)
@@ -171,13 +174,13 @@ class SurfaceGatherer:
             gap = np.repeat(gap[: self._owned, None] / self._model.material.h, len(self._places), axis=1)
             values[GAP] = np.minimum(values.get(GAP, np.inf), gap)
         averaged = {name: self._averaged(each) for name, each in values.items()}
-        nodes = self._averaged(jet[0])
+        nodes, law = self._averaged(jet[0]), self._law_at_nodes()
         stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)
         tensors = {name: self._gathered(np.einsum("...ia,...a->...i", self._six, S)) for name, S in stresses.items()}
         if not self._recovered:
             return None
         smooth, jumps = self._recovered.fields(tensors, self._n0)
-        fields = self._constant | smooth | rubber_fields(smooth, self._model.material.law) | averaged
+        fields = self._constant | smooth | rubber_fields(smooth, law) | averaged
         names = self._model.midsurface.shells
         return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"], shells=names)
 
@@ -210,7 +213,15 @@ class SurfaceGatherer:
     def _made_of(self) -> Array | None:
         """The material of each owned cell, where shells have their own."""
         own = self._model.made_of
-        return None if own is None else own.x.array.reshape(-1, 3)[own.function_space.dofmap.list[: self._owned, 0]]
+        return None if own is None else own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[: self._owned, 0]]
+
+    def _law_at_nodes(self) -> Law:
+        """Collective; on rank 0 with arrays (nodes,)."""
+        own, law = self._made_of(), self._model.material.law
+        if own is None:
+            return law
+        e, nu, _, which = (self._averaged(np.repeat(each[:, None], len(self._places), axis=1)) for each in own.T)
+        return law.made_of(e, nu, which)
 
     def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
         """The matrix of the mean of the cells that share a node, weighted by area, from the nodes of all cells."""

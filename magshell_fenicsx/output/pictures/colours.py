@@ -114,11 +114,11 @@ def bent_alone(surface: Surface, h: float) -> str:
 
 
 def stretches(surface: Surface) -> list[Coloured]:
-    """Stretches and true stresses of rubber; stresses are white at zero."""
+    """Stretches and true stresses of rubber; stresses are white at zero. Shells of another law beside it have none."""
     coloured = []
     for name, said in STRETCHES.items():
         if (values := surface.fields.get(name)) is not None:
-            low, high, signed = float(values.min()), float(values.max()), name.startswith("sigma")
+            low, high, signed = float(np.nanmin(values)), float(np.nanmax(values)), name.startswith("sigma")
             limits = from_zero(low, max(high, ROUNDING["E_1"])) if signed else (low, max(high, low + 1e-9))
             coloured.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
     return coloured

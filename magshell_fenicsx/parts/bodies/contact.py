@@ -95,10 +95,18 @@ def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face
 
 
 def thinned_energy(
-    r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, F: Expr, *factor: Expr, natural: Forms | None = None
+    r0: Jet,
+    u: Jet,
+    P: Expr,
+    motion: Expr,
+    approach: Expr,
+    F: Expr,
+    *factor: Expr,
+    natural: Forms | None = None,
+    thins: Expr | int = 1,
 ) -> Expr:
     """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies, multiplies."""
-    s, t = _moved(u, P, motion, approach), thinned(r0, u, natural)
+    s, t = _moved(u, P, motion, approach), thinned(r0, u, natural, thins)
     return _polynomial(P, s) + _of_face(F, factor[0][0] * t if factor else t, s)
 
 

@@ -39,7 +39,7 @@ class Shape:
     swept
         Whether the cells are those of a meridian.
     thins
-        Whether the thickness follows from the area, so that the volume stays.
+        1 where the thickness follows from the area, so that the volume stays; of each cell (cells, 1), or of all.
     """
 
     element: Any
@@ -50,7 +50,7 @@ class Shape:
     h: float
     thick: tuple[Any, Array] | None = None
     swept: bool = False
-    thins: bool = False
+    thins: Array | float = 0
 
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
         """Places on the reference cell of coordinates (n, m, 2), their derivatives (n, m, 2, d), and azimuths (n, m).
@@ -144,10 +144,16 @@ class Jets:
     @property
     def thickness(self) -> Array:
         """(n, m) of the deformed shell, over R."""
-        if not self.shape.thins:
+        if not np.any(self.shape.thins):
             return np.asarray(self.t[0])
         area0, area = (np.linalg.norm(np.cross(a[1], a[2]), axis=-1) for a in (self.r0, self.r))
-        return np.asarray(self.t[0] * area0 / area)
+        return np.asarray(self.t[0] * (1 + self._thins * (area0 / area - 1)))
+
+    @property
+    def _thins(self) -> Array | float:
+        """Of these cells."""
+        thins = self.shape.thins
+        return np.asarray(thins)[self.cells] if np.ndim(thins) else thins
 
     def place(self, eta: float) -> Array:
         """(n, m, 3) of the deformed shell."""
@@ -158,7 +164,7 @@ class Jets:
         m = np.cross(self.r[1], self.r[2])
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         n = m / size
-        along = 2 if self.shape.thins else 1  # the thickness is over |m| too
+        along = 1 + np.asarray(self._thins)[..., None]  # the thickness is over |m| too
         across = (on_n - along * np.sum(on_n * n, axis=-1, keepdims=True) * n) / size  # dJ/dm
         on = np.stack([on_x, np.cross(self.r[2], across), np.cross(across, self.r[1])])
         if self.shape.swept:

@@ -58,7 +58,8 @@ class OwnField:
         pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
         self.Br = pattern_field(pattern, sight.model.r0)[0]
         self._thickness = sight.model.thickness
-        self._thins = sight.model.material.law.thins
+        thins = sight.model.law_of_cells.thins
+        self._thins = thins[: self._owned] if np.ndim(thins) else thins
         self._plain = of.law == "deformation" and of.soft is None
         if not self._plain:
             carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
@@ -163,8 +164,8 @@ class OwnField:
         area = np.sum(m * n, axis=-1, keepdims=True)
         first, second = (np.sum(each * J, axis=-1, keepdims=True) / area for each in (np.cross(r2, n), np.cross(n, r1)))
         across = np.sum(n * J, axis=-1, keepdims=True)
-        if self._thins:  # over the stretch of the thickness
-            across = across * area / frame.area[..., None]
+        if np.any(self._thins):  # over the stretch of the thickness
+            across = across * (1 + np.asarray(self._thins)[..., None] * (area / frame.area[..., None] - 1))
         return np.asarray(first * r0[1] + second * r0[2] + across * frame.n0)
 
     def _to_material(self, into: Nodal, mu: Mapping[str, float]) -> Nodal:

@@ -98,7 +98,11 @@ class _TangentEnergy:
         self._a, self._raise, self._strain = first, np.linalg.inv(metric0), (metric - metric0) / 2
         places = np.einsum("qp,npc->nqc", self._table[0], gathered(scene, model.r0.x.array[: model.system.size]))
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
-        self._law = scene.problem.material.law.at(places, a1, a2, np.cross(a1, a2))
+        own = None
+        if (made_of := getattr(model, "made_of", None)) is not None:
+            rows = made_of.x.array.reshape(-1, 4)[: made_of.function_space.dofmap.index_map.size_local]
+            own = np.concatenate(scene.comm.allgather(rows))
+        self._law = scene.problem.material.law_in(own).at(places, a1, a2, np.cross(a1, a2))
         self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
         self._area = np.sqrt(np.linalg.det(metric0))
 

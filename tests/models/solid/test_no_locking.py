@@ -9,7 +9,7 @@ from bodies import plate
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 from magshell_fenicsx.shells.solid_terms import WHOLE, SolidTerm, TermFactory
@@ -22,7 +22,7 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
 
     With `whole`, compression takes all 27 quadrature points.
     """
-    material = NeoHookean.of(0.5, bulk_to_shear)
+    material = MooneyRivlin.of(0.5, bulk_to_shear)
     loads = Loads(pressure=True)
     model = SolidModel(plate(0.3, H, half=True), Material(0.5, H), material, CONDITIONS, loads)  # type: ignore[arg-type]
     system = model.system

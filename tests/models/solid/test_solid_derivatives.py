@@ -12,14 +12,15 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.mesh.hexahedra import OUTER, face_measure
 from magshell_fenicsx.models.shell.parameters import EdgeMoment, Material
 from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
-EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
+DISTORTIONS = {"distortion", "areal distortion"}
+EVERYWHERE = {*DISTORTIONS, "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
 AT_ENDS = {"pressure whole", "pressure upper", "load moment rim 0"}
 FIELD = Magnetisation(
     np.array([0.6, 0.0, 0.8]),
@@ -37,7 +38,7 @@ def model(request: pytest.FixtureRequest) -> SolidModel:
     conditions = {"rim": "clamped" if uniform else "simply supported", "symmetry": "symmetry"}
     field = FIELD if uniform else replace(FIELD, remanent=radial)
     loads = Loads(pressure=True, magnetic=field, dead={} if uniform else {"load": (EdgeMoment("rim", 0.7),)})
-    return SolidModel(body, Material(0.5, h), NeoHookean.of(0.5, 100.0), conditions, loads)  # type: ignore[arg-type]
+    return SolidModel(body, Material(0.5, h), MooneyRivlin.of(0.5, 100.0, 0.4), conditions, loads)  # type: ignore[arg-type]
 
 
 def displacement(model: SolidModel) -> np.ndarray:

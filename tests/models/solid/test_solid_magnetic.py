@@ -13,7 +13,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.solid import SolidModel
@@ -22,7 +22,7 @@ H = 0.1
 G = FIELD.gradient
 assert G is not None
 LINEAR = [f"{b} + {g[0]}*x + {g[1]}*y + {g[2]}*z" for b, g in zip(FIELD.applied, G, strict=True)]
-MATERIAL, NEO_HOOKEAN = Material(0.5, H), NeoHookean.of(0.5, 100.0)
+MATERIAL, NEO_HOOKEAN = Material(0.5, H), MooneyRivlin.of(0.5, 100.0)
 BR, BA = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8])
 THIN = 1.1**-0.5
 DEFORMATIONS = {

@@ -16,7 +16,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Material, PointForce
-from magshell_fenicsx.models.solid.densities import NeoHookean
+from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel
@@ -90,7 +90,7 @@ def test_loads_add_up_to_their_resultants(load: Any) -> None:
         points={"A": [1.0, 0.0, 1.0]},
         factor=lambda x: 1 + 0.3 * x[:, 2],
     )
-    model = SolidModel(body, Material(0.3, H), NeoHookean.of(0.3, 100.0), {}, Loads(dead={"load": (load,)}))
+    model = SolidModel(body, Material(0.3, H), MooneyRivlin.of(0.3, 100.0), {}, Loads(dead={"load": (load,)}))
     X = model.r0.x.array.reshape(-1, 3)
     for axis, force in zip(np.eye(3), (1.0, 2.0, 3.0), strict=True):
         assert resultant(model, np.tile(axis, (len(X), 1))) == pytest.approx(force, rel=1e-3)
@@ -100,7 +100,7 @@ def test_a_moment_turns_the_end_about_its_edge() -> None:
     """Its work on a small rotation about y is the moment per length times the length, the sign as the shell's."""
     body = body_of(STRIP, 0.2, layers=2)
     moment = Loads(dead={"load": (EdgeMoment("right", 3.0),)})
-    model = SolidModel(body, Material(0.3, H), NeoHookean.of(0.3, 100.0), {}, moment)
+    model = SolidModel(body, Material(0.3, H), MooneyRivlin.of(0.3, 100.0), {}, moment)
     X = model.r0.x.array.reshape(-1, 3)
     assert resultant(model, np.cross([0.0, 1.0, 0.0], X)) == pytest.approx(3.0 * WIDTH, rel=1e-9)
     for translation in np.eye(3):
@@ -222,7 +222,7 @@ def test_layers_pull_a_strip_crooked() -> None:
     """
     body, e1, lambda_m = body_of(STRIP, 0.2, layers=2, points=TIP), np.eye(3)[0], 1e-6
     field = Magnetisation(0 * e1, e1, layers=((0.5, e1), (0.5, -e1)))
-    model = SolidModel(body, Material(0.0, H), NeoHookean.of(0.0, 100.0), {"left": "clamped"}, Loads(magnetic=field))
+    model = SolidModel(body, Material(0.0, H), MooneyRivlin.of(0.0, 100.0), {"left": "clamped"}, Loads(magnetic=field))
     factors = Factorisation(model.system.comm)
     factors.factor(model.system.tangent(model.zero(), {"lambda_m": 0.0}))
     u = factors.solve(-model.system.load(model.zero(), {}, "lambda_m"))
