@@ -18,7 +18,6 @@ from pydantic import BaseModel, Field, ValidationError
 
 from magshell_fenicsx.case.members import Members
 from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section, or_number, texts
-from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Place
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.laminate import laminate_of

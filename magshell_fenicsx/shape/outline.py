@@ -144,7 +144,7 @@ class Outline:
         return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
 
     def placed(self, shape: Chart) -> Embedding:
-        """The map to space of what is meshed: shells of which there are several each have a chart in their own frame."""
+        """The map to space of what is meshed: halves of several shells have charts in frames of their own."""
         if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly) and shape.given.halved:
             return shape.given.patch.embedding
         return self.embedding

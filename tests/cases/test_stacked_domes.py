@@ -25,7 +25,7 @@ def alone(shell: dict[str, Any], w: float) -> float:
 
 @pytest.mark.slow
 def test_stacked_domes() -> None:
-    """One after the other: the upper one snaps as it does alone, 1e-3, and falls on the lower one at its own force there;
+    """One after the other: the upper one snaps as it does alone, 1e-3, and at its own force falls on the lower one;
     both snap where the force is the sum of those of each alone at its displacement, 2e-2."""
     source = read_source(CASES / "stacked_domes.yaml")
     upper, lower = (source.data["shells"][name] for name in ("upper", "lower"))

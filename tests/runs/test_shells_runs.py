@@ -74,7 +74,8 @@ def test_two_shells_from_python() -> None:
     upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, mesh=finer, **keys)
     points = {"lower.tip": [0, 0, "25 mm"], "upper.tip": [0, 0, "25 mm"]}
     clamped = ms.Clamped("lower.rim", "upper.rim")
-    both = ms.run(ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points, symmetry="none")).rows[-1]
+    problem = ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points, symmetry="none")
+    both = ms.run(problem).rows[-1]
     for name, sign in (("lower", 1), ("upper", -1)):
         alone = ms.Shell("cap", thickness=thick[name], **keys)
         elements = ms.Section("mesh", degree=2, **(finer if name == "upper" else {"size": "8 mm"}))

@@ -97,7 +97,7 @@ def test_ensemble(tmp_path: Path) -> None:
 
 
 def test_gradients(tmp_path: Path) -> None:
-    """By numbers of one shell, at the load in its unit: differences of it alone, 1e-4; the other one does not feel them."""
+    """By numbers of one shell, at the load in its unit: differences of it alone, 1e-4; not of the other."""
     modulus = "shells.lower.shell.youngs_modulus"
     results = ["lower_tip_uz_mm", "upper_tip_uz_mm"]
     case = written(tmp_path, gradients={"of": results, "by": [modulus, THICK]})

@@ -136,7 +136,7 @@ class Background:
         return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts, names=names)
 
     def _names(self) -> tuple[tuple[float, float, str], ...]:
-        """The name of each of several shells, where it is seen: at the place next to the middle of what is seen of it."""
+        """The name of each of several shells, as far as it is seen: next to the middle of that part."""
         r, number = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
         if number is None:
             return ()

@@ -69,8 +69,10 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """Planes of both shells of each pair, where a place and the nearest of the other shell are on one side; none of a
-        shell that may touch itself, for it may touch its own mirror image."""
+        """Planes of both shells of each pair: a place and the nearest one of the other shell are on one side of them.
+
+        A shell that may touch itself leaves none: it may touch its own mirror image.
+        """
         mirrors = nothing if _touch_themselves(self.given, [*(context.sections.get("shells") or {})]) else everything
         return [Leaves("contact: shells that may touch are modelled with their circumference", mirrors=mirrors)]
 
