@@ -235,8 +235,14 @@ class InView:
         return self._depth
 
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
-        """The image (height, width, 4) of values (n,) at nodes; transparent around the surface."""
-        return self.painted(self._pieces.at(values), limits, colours(np.arange(colours.N))[:, :3])
+        """The image (height, width, 4) of values (n,) at nodes, grey where they are nan; transparent around."""
+        table, at = colours(np.arange(colours.N))[:, :3], self._pieces.at(values)
+        nowhere = np.isnan(at)
+        image = self.painted(np.where(nowhere, limits[0], at), limits, table)
+        if not nowhere.any():
+            return image
+        bright = self.painted(nowhere * 1.0, (0.0, 1.0), np.repeat([[0.0], [1.0]], 3, axis=1))[..., :1] > NONE_HERE
+        return np.where(bright, self.plain(NO_VALUE), image)
 
     def plain(self, grey: float) -> Image:
         """The image of a surface in one grey."""
@@ -332,6 +338,8 @@ def deflected_place(surface: Surface) -> Array:
     return np.asarray(surface.r0[np.argmax(np.abs(surface.w))])
 
 
+NO_VALUE = 0.86  # the grey of what has none
+NONE_HERE = 60  # brightness of 255 of what is white in any light
 FAR = 2.5  # of the shell's extent, from its middle: sources farther away are not drawn
 SAME = 1e-3  # of that reach: lines as near as this meet
 
