@@ -79,7 +79,8 @@ class Members:
     def _own(self, part: "Part", plane: Mirror) -> Mirror:
         """A plane in the frame of a shell and over its own length, with its edges that are lost."""
         place, start = self._several.place(part), f"{part.name}_"
-        own = Mirror.of(place.Q.T @ plane.normal, (plane.offset - plane.normal @ place.position) / place.scale)
+        offset = float(plane.offset - plane.normal @ place.position) / place.scale
+        own = Mirror.of(place.Q.T @ plane.normal, offset)
         lost = {a.removeprefix(start): b.removeprefix(start) for a, b in plane.lost.items() if a.startswith(start)}
         return replace(own, offset=0.0 if abs(own.offset) < ROUNDING else own.offset, lost=lost)
 
