@@ -106,11 +106,13 @@ class Evaluated:
         return whole if system.projection is None else whole + system.projection.outside(self._u)
 
     def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
-        """The terms whose energy or gradient is not a number; collective."""
+        """The terms whose energy or gradient is not a number, with why if they say so (`no_number`); collective."""
         system = self._system
         used = [t for t in system.terms if factors[t.name]]
         sizes = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
-        return [name for name, size in sizes.items() if not system._finite(size)] or ["the sum of all terms"]
+        why = {t.name: getattr(t, "no_number", "") for t in used}
+        strange = [name + why[name] for name, size in sizes.items() if not system._finite(size)]
+        return strange or ["the sum of all terms"]
 
     def forces(self, name: str = "") -> Vector:
         """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""

@@ -1,11 +1,14 @@
 """Sheets of one mesh file that are not connected: they are oriented and held one by one, and pressed together."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from along import csr
 from numpy.typing import NDArray
+from scipy.sparse.linalg import spsolve
 from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
@@ -64,6 +67,22 @@ def test_meshes_that_do_not_match(tmp_path: Path) -> None:
     deep = -seen["contact_gap_over_h"] * h
     assert seen["contact_force"] * scene.model.force_unit == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=2e-3)
     assert pressure.min() > 0
+
+
+def test_newton_is_quadratic(tmp_path: Path) -> None:
+    """Beside the equilibrium of pressed sheets, each error is of the order of the square of the one before."""
+    scene, _, _ = pressed(tmp_path, (2, 2), (3, 2))
+    *_, last = follow(scene)
+    system, exact, mu = scene.model.system, last.point.state.u, last.point.state.mu
+    rough = system.held(np.random.default_rng(0).standard_normal(system.size))
+    u, errors = exact + 2e-5 * h * rough, list[float]()
+    for _ in range(5):
+        u = u - spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
+        errors.append(float(np.abs(u - exact).max()) / h)
+    below = [(a, b) for a, b in pairwise(errors) if b > 1e-13]
+    assert errors[-1] < 1e-11
+    assert len(below) >= 3
+    assert all(b < 1e4 * a**2 for a, b in below), errors
 
 
 def test_a_piece_that_is_not_held(tmp_path: Path) -> None:

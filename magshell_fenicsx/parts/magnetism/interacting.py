@@ -41,6 +41,7 @@ class InteractionTerm:
     """
 
     group, column = "magnetic", "magnetic"
+    no_number = " (parts touch or nearly do, and magnetism does not keep them apart: name them in contact)"
 
     def __init__(self, model: "Observed", u: fem.Function, of: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE

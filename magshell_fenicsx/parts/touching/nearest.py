@@ -24,7 +24,8 @@ BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all o
 LATTICE = 4  # parts of a side of a cell, between which the search for the nearest place begins
 STRIP = 500  # vertices from which ways are searched together
 ROUNDS = 30  # Newton's steps at most
-EXACT = 1e-14  # a smaller step, in the reference cell, is none
+EXACT = 1e-10  # after a smaller step, in the reference cell, the place is exact: steps converge quadratically
+INWARDS = 1e-17  # a smaller change of a barycentric coordinate leads to no side
 FLAT = 1e-3  # of the determinant of a plane's Hessian: below it the step takes the plane's
 ON_SIDE = 1e-12  # a barycentric coordinate that is zero
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -170,7 +171,7 @@ def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Arra
         step = -_reduced(free, A, g)
         coordinates, change = _barycentric(at), step @ DOWN.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(change < -EXACT * 1e-3, -coordinates / change, np.inf)
+            room = np.where(change < -INWARDS, -coordinates / change, np.inf)
         part = np.minimum(room.min(axis=1), 1.0)
         after = at + part[:, None] * step
         hit = _barycentric(after)
