@@ -1,7 +1,7 @@
 """Terms whose tangent has entries outside the pattern of the others: between some unknowns, or between all of them.
 
 The couplings of contact change from state to state: their entries are added to a copy of the sparse matrix. Where all
-unknowns act on each other the sum has all its entries (`assembly.whole.WholeMatrix`).
+unknowns act on each other dense rows stand beside it (`assembly.whole.WholeMatrix`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.assembly.whole import WholeMatrix, WholeTerm
+from magshell_fenicsx.continuation.system import Beside
 
 Array = NDArray[np.float64]
 Entries: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Array]  # global rows and columns, and values
@@ -33,23 +34,28 @@ class Couplings(Protocol):
 
 
 def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:
-    """What the terms among these add that are `Coupled` or a `WholeTerm`; `clamped` are homogeneous conditions."""
+    """What the terms among these add that are `Coupled`; `clamped` are homogeneous conditions."""
     coupled = [t for t in terms if isinstance(t, Coupled)]
-    of_all = [t for t in terms if isinstance(t, WholeTerm)]
-    changing: list[Couplings] = [ChangingEntries(V, coupled, clamped)] if coupled else []
-    return [*changing, OfAll(WholeMatrix(V, clamped), of_all)] if of_all else changing
+    return [ChangingEntries(V, coupled, clamped)] if coupled else []
+
+
+def of_all(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> "OfAll | None":
+    """What the terms among these add that are a `WholeTerm`; None if there are none."""
+    found = [t for t in terms if isinstance(t, WholeTerm)]
+    return OfAll(WholeMatrix(V, clamped), found) if found else None
 
 
 @dataclass(frozen=True)
 class OfAll:
-    """Those of terms in which all unknowns act on each other: the sum of the tangent is a dense matrix."""
+    """Those of terms in which all unknowns act on each other: dense rows beside the sparse tangent."""
 
     matrix: WholeMatrix
     terms: Sequence[WholeTerm]
 
-    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """See `Couplings`."""
-        return self.matrix.sum(K, self._among(factors))
+    def beside(self, K: PETSc.Mat, factors: Factors, *, rough: bool) -> PETSc.Mat | Beside:
+        """A sparse matrix and these terms; if `rough`, those of an earlier state. Collective."""
+        terms = self._among(factors)
+        return self.matrix.beside(K, terms, rough=rough) if terms else K
 
     def times(self, v: Array, factors: Factors) -> Array:
         """See `Couplings`."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
-from magshell_fenicsx.continuation.system import Amplitudes, Skewed, Vector, Weighted
+from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, Vector, Weighted
 
 if TYPE_CHECKING:
     from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -172,8 +172,10 @@ class Evaluated:
             own += sum(slope.energy() for slope in second.slopes if slope.amplitude == name)
         return float(system.comm.allreduce(own))
 
-    def tangent(self, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None) -> PETSc.Mat | Skewed:
-        """d2Pi/du2, see `System`; `times` multiplies the tangents of some terms, by name."""
+    def tangent(
+        self, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None, *, rough: bool = False
+    ) -> PETSc.Mat | Beside | Skewed:
+        """d2Pi/du2, see `FiniteElementSystem.tangent`."""
         system = self._system
         with system.assembly:
             whole = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
@@ -181,7 +183,7 @@ class Evaluated:
             factors = system._factors(self._mu)
             for name, size in (times or {}).items():
                 factors[name] *= size
-            return system._tangent(factors, whole)
+            return system._tangent(factors, whole, rough=rough)
 
     @property
     def _present(self) -> "FiniteElementSystem":

@@ -16,14 +16,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.coupled import couplings
+from magshell_fenicsx.assembly.coupled import couplings, of_all
 from magshell_fenicsx.assembly.evaluated import Evaluated, Noise
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
 from magshell_fenicsx.continuation.factor import Stopwatch
-from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
+from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, State, Vector, Weighted, symmetric_part
 from magshell_fenicsx.platform import compat
 
 Setting: TypeAlias = tuple[Settable, float]  # a number of the terms, and its value in a state that has none
@@ -94,7 +94,7 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
-        self.couplings = couplings(V, terms, clamped)
+        self.couplings, self.of_all = couplings(V, terms, clamped), of_all(V, terms, clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
@@ -107,6 +107,11 @@ class FiniteElementSystem:
             self._K = fem_petsc.create_matrix(pattern.tangent_form)
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
+
+    @property
+    def dear(self) -> bool:
+        """See `continuation.system.Roughly`."""
+        return self.of_all is not None
 
     def at(self, state: State) -> Evaluated:
         """A state, to be asked for what it has."""
@@ -164,10 +169,19 @@ class FiniteElementSystem:
         return Evaluated(self, u, mu).stored()
 
     def tangent(
-        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None
-    ) -> PETSc.Mat | Skewed:
-        """See `System`; `times` multiplies the tangents of some terms, by name."""
-        return Evaluated(self, u, mu).tangent(stress, times)
+        self,
+        u: Vector,
+        mu: Amplitudes,
+        stress: Sequence[Weighted] = (),
+        times: Mapping[str, float] | None = None,
+        *,
+        rough: bool = False,
+    ) -> PETSc.Mat | Beside | Skewed:
+        """See `System`; `times` multiplies the tangents of some terms, by name.
+
+        If `rough`, what all unknowns add to each other may be that of an earlier state.
+        """
+        return Evaluated(self, u, mu).tangent(stress, times, rough=rough)
 
     def held(self, u: Vector) -> Vector:
         """The displacement with zeros at the supports."""
@@ -265,11 +279,13 @@ class FiniteElementSystem:
             product[: self.size] = (K * given).array
         for coupling in self.couplings:
             product = product + coupling.times(v, factors)
+        if self.of_all:
+            product = product + self.of_all.times(v, factors)
         return product
 
     def _tangent(
-        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
-    ) -> PETSc.Mat | Skewed:
+        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]], *, rough: bool = False
+    ) -> PETSc.Mat | Beside | Skewed:
         """That of the terms with these factors; `stress` has ghosts."""
         if self._assembler:
             K = self._assembler.tangent(factors, stress)
@@ -277,11 +293,14 @@ class FiniteElementSystem:
             K = self._of_forms(self._K, factors, self.clamped)
         for coupling in self.couplings:
             K = coupling.sum(K, factors)
+        N = self._skew(factors)
+        if self.of_all:
+            K = self.of_all.beside(K, factors, rough=rough)
+            K = symmetric_part(K) if N or self.projection or self.noise else K
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
-        N = self._skew(factors)
         return Skewed(K, N) if N else K
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:

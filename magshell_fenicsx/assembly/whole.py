@@ -1,10 +1,12 @@
 """The tangent of a system in which all unknowns act on each other: the sparse matrix and dense rows.
 
-The sum is a matrix of PETSc with all its entries, so factors, inertia, folds and modes are those of any system. Its
-memory and its factors grow with the square and the cube of the number of unknowns.
+Both are kept apart, as factors of the sparse one mostly serve (`continuation.beside`). Their sum is one of PETSc with
+all entries, of which factors, inertia, folds and modes are those of any system. Its memory and its factors grow
+with the square and the cube of the number of unknowns.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.continuation.system import Beside, Vector
 
 Array = NDArray[np.float64]
 
@@ -21,14 +24,33 @@ Array = NDArray[np.float64]
 class WholeTerm(Term, Protocol):
     """A term whose tangent couples nodes that share no cell and no edge."""
 
-    def add_rows(self, rows: Array, factor: float) -> None:
-        """Add factor d2Pi/du2, without supports, to this rank's part of its rows.
+    def rows(self, *, rough: bool = False) -> Array:
+        """This rank's part of d2Pi/du2, without supports, (local nodes with ghosts, 3, all nodes, 3). Collective.
 
-        Parameters
-        ----------
-        rows
-            (local nodes with ghosts, 3, all nodes, 3).
+        Nobody writes into it. If `rough`, it may be that of an earlier state.
         """
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Terms times factors, without the rows and columns of supports: a `continuation.system.Rest`."""
+
+    matrix: "WholeMatrix"
+    parts: Sequence[tuple[float, Array]]  # factors, and this rank's rows (own unknowns, all)
+
+    def times(self, v: Vector) -> Vector:
+        """See `Rest`."""
+        here, everywhere = self.matrix.held
+        whole = np.where(everywhere, 0.0, np.concatenate(self.matrix.comm.allgather(v)))
+        return np.where(here, 0.0, sum(factor * (rows @ whole) for factor, rows in self.parts))
+
+    def scaled(self, factor: float) -> "Dense":
+        """See `Rest`."""
+        return Dense(self.matrix, [(factor * each, rows) for each, rows in self.parts])
+
+    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
+        """See `Rest`."""
+        return self.matrix.sum(K, self.parts)
 
 
 class WholeMatrix:
@@ -42,65 +64,77 @@ class WholeMatrix:
 
     def __init__(self, V: fem.FunctionSpace, clamped: Sequence[fem.DirichletBC]) -> None:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
-        self._comm, self._owned, self._ghosts = comm, nodes.size_local, nodes.num_ghosts
+        self._owned, self._ghosts = nodes.size_local, nodes.num_ghosts
         self._first, self._count = nodes.local_range[0], nodes.size_global
         self._numbers = nodes.local_to_global(np.arange(self._owned, self._owned + self._ghosts, dtype=np.int32))
         self._owners = nodes.owners
-        n, first, whole = 3 * self._owned, 3 * self._first, 3 * self._count
+        n = 3 * self._owned
         held = np.zeros(n, dtype=bool)
         for bc in clamped:
             dofs = bc.dof_indices()[0]
             held[dofs[dofs < n]] = True
-        self._held = held, np.concatenate(comm.allgather(held))
+        self.comm, self.held = comm, (held, np.concatenate(comm.allgather(held)))
+        self._whole: tuple[Array, Array, PETSc.Mat] | None = None
+        self._summed: dict[str, tuple[Array, Array]] = {}
+
+    def _made(self) -> tuple[Array, Array, PETSc.Mat]:
+        """The entries in columns of own nodes and in others, which the third, their matrix, shares."""
+        n, first, whole = 3 * self._owned, 3 * self._first, 3 * self._count
         kind = PETSc.IntType
-        self._inner, self._outer = np.zeros((n, n)), np.zeros((n, whole - n))
+        inner, outer = np.zeros((n, n)), np.zeros((n, whole - n))
         outside = np.delete(np.arange(whole, dtype=kind), np.s_[first : first + n])
         starts = [np.arange(0, n * width + 1, width or 1, dtype=kind)[: n + 1] for width in (n, whole - n)]
         starts[1] = starts[1] if whole > n else np.zeros(n + 1, dtype=kind)
-        parts = [(starts[0], np.tile(np.arange(n, dtype=kind), n), self._inner.reshape(-1))]
-        if comm.size > 1:
-            parts.append((starts[1], np.tile(outside, n), self._outer.reshape(-1)))
+        parts = [(starts[0], np.tile(np.arange(n, dtype=kind), n), inner.reshape(-1))]
+        if self.comm.size > 1:
+            parts.append((starts[1], np.tile(outside, n), outer.reshape(-1)))
         size = ((n, None), (n, None))
-        self._K = PETSc.Mat().createAIJWithArrays(size, parts[0] if comm.size == 1 else tuple(parts), comm=comm)
+        K = PETSc.Mat().createAIJWithArrays(size, parts[0] if len(parts) == 1 else tuple(parts), comm=self.comm)
         self._kept = parts  # the arrays that PETSc shares
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
-            self._K.setOption(option, True)
+            K.setOption(option, True)
+        return inner, outer, K
 
-    def sum(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]]) -> PETSc.Mat:
-        """A sparse matrix plus terms times factors. Collective."""
-        n, first = 3 * self._owned, 3 * self._first
-        alone = self._comm.size == 1
-        into = self._inner.reshape(self._owned, 3, self._count, 3) if alone else None  # nothing is copied
-        rows = self._own(self.rows(terms, into)).reshape(n, 3 * self._count)
-        own, everywhere = self._held
+    def beside(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]], *, rough: bool = False) -> Beside:
+        """A sparse matrix and terms times factors beside it. Collective."""
+        return Beside(K, Dense(self, [(factor, self.rows(term, rough=rough)) for factor, term in terms]))
+
+    def sum(self, K: PETSc.Mat, parts: Sequence[tuple[float, Array]]) -> PETSc.Mat:
+        """A sparse matrix plus rows times factors. Collective."""
+        n, first, (own, everywhere) = 3 * self._owned, 3 * self._first, self.held
+        self._whole = inner, outer, matrix = self._whole or self._made()
+        rows = inner if self.comm.size == 1 else np.empty((n, 3 * self._count))  # nothing is copied
+        rows[:] = 0.0
+        for factor, part in parts:
+            rows += factor * part
         rows[own], rows[:, everywhere] = 0.0, 0.0
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
-        if not alone:
-            self._inner[:] = rows[:, first : first + n]
-            self._outer[:] = np.delete(rows, np.s_[first : first + n], axis=1)
-        self._K.stateIncrease()
-        return self._K
+        if self.comm.size > 1:
+            inner[:] = rows[:, first : first + n]
+            outer[:] = np.delete(rows, np.s_[first : first + n], axis=1)
+        matrix.stateIncrease()
+        return matrix
 
-    def rows(self, terms: Sequence[tuple[float, WholeTerm]], into: Array | None = None) -> Array:
-        """This rank's part of the rows of its nodes, ghosts too, see `WholeTerm`; in an array if given. Collective."""
-        rows = np.empty((self._owned + self._ghosts, 3, self._count, 3)) if into is None else into
-        rows[:] = 0.0
-        for factor, term in terms:
-            term.add_rows(rows, factor)
-        return rows
+    def rows(self, term: WholeTerm, *, rough: bool = False) -> Array:
+        """The rows (own unknowns, all) of a term, summed over the ranks, supports too. Collective."""
+        parts, (known, summed) = term.rows(rough=rough), self._summed.get(term.name, (None, np.empty(0)))
+        if known is not parts:
+            summed = self._own(parts).reshape(3 * self._owned, -1)
+            self._summed[term.name] = parts, summed
+        return summed
 
     def times(self, terms: Sequence[tuple[float, WholeTerm]], v: Array) -> Array:
         """This rank's part of the terms' product with a vector, both with ghosts. Collective."""
-        whole = np.concatenate(self._comm.allgather(v[: 3 * self._owned]))
-        return np.asarray(self.rows(terms).reshape(len(v), -1) @ whole)
+        whole = np.concatenate(self.comm.allgather(v[: 3 * self._owned]))
+        return np.asarray(sum(factor * (term.rows().reshape(len(v), -1) @ whole) for factor, term in terms))
 
     def _own(self, rows: Array) -> Array:
         """The rows of own nodes, summed over the ranks."""
-        own, ghosts = rows[: self._owned], rows[self._owned :]
-        if self._comm.size == 1:
-            return own
-        leaving = [np.flatnonzero(self._owners == rank) for rank in range(self._comm.size)]
-        for numbers, part in self._comm.alltoall([(self._numbers[i], ghosts[i]) for i in leaving]):
+        if self.comm.size == 1:
+            return rows
+        own, ghosts = rows[: self._owned].copy(), rows[self._owned :]
+        leaving = [np.flatnonzero(self._owners == rank) for rank in range(self.comm.size)]
+        for numbers, part in self.comm.alltoall([(self._numbers[i], ghosts[i]) for i in leaving]):
             np.add.at(own, numbers - self._first, part)
         return own

@@ -12,11 +12,13 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.system import Edged, Skewed, Tangent, Vector, dot, symmetric_part
+from magshell_fenicsx.continuation.beside import crossings, solved
+from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
 # PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
+PATIENT = 8  # factorisations of all entries after one that the factors of the sparse part could not stand for
 CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
 REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
 ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
@@ -29,7 +31,8 @@ class Factorisation:
     On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
     pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is tried again after
     `CALM` successive matrices in which MUMPS counts none. The memory of the other one is released. A skewed tangent
-    K + N takes two factorisations: that of K for the inertia, and LU of the sum for the solutions.
+    K + N takes two factorisations: that of K for the inertia, and LU of the sum for the solutions. Of K + D, in which
+    all unknowns act on each other, only K is factored where D is small beside it (`continuation.beside`).
 
     Attributes
     ----------
@@ -44,6 +47,9 @@ class Factorisation:
         less one where det (K + N) has the other sign: then it has been singular once less often.
     skewed
         Whether that tangent was a skewed one.
+    doubt
+        Where K was factored in place of K + D, the inverse of the error of D, relative to it, with which the pivots'
+        signs would still be certain; else infinite.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -59,6 +65,9 @@ class Factorisation:
         self._edge: Edge | None = None
         self._edged: Edged | None = None
         self.skewed = False
+        self._rest: Rest | None = None
+        self._waiting = 0  # factorisations until the factors of a sparse part are tried again
+        self.doubt = np.inf
 
     def factor(self, tangent: Tangent) -> None:
         """Factor a matrix; an edged one by the factors of its K and k back-solves.
@@ -68,14 +77,12 @@ class Factorisation:
         PETSc.Error
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other than the matrix.
         """
-        K, inner = symmetric_part(tangent), tangent.K if isinstance(tangent, Edged) else tangent
+        inner = tangent.K if isinstance(tangent, Edged) else tangent
         self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
-            self.matrix, self._edge = K, None
-            if self._rhs is None:
-                self._rhs, self._solution = K.createVecs()
-            if not (self._definite and self._factor_definite(K)):
-                self._factor_any(K)
+            self._edge = self._rest = None
+            if not (isinstance(inner, Beside) and self._factor_beside(inner)):
+                self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, Skewed):
                 self._factor_sum(inner)
         self.count += 1
@@ -104,6 +111,33 @@ class Factorisation:
     def norm(self) -> float:
         """The largest sum of magnitudes in a row of K."""
         return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
+
+    def _factor_symmetric(self, K: PETSc.Mat) -> None:
+        self.matrix, self.doubt = K, np.inf
+        if self._rhs is None:
+            self._rhs, self._solution = K.createVecs()
+        if not (self._definite and self._factor_definite(K)):
+            self._factor_any(K)
+
+    def _factor_beside(self, tangent: Beside) -> bool:
+        """Factor the sparse part of K + D; False if D is not small beside it."""
+        self._waiting -= 1
+        if self._waiting > 0:
+            return False
+        self._factor_symmetric(tangent.K)
+        noise = np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
+        counted = crossings(
+            lambda v: self._back(tangent.D.times(v)),
+            lambda x: dot(self.comm, x, tangent.D.times(x)),
+            self._back(np.asarray(noise)),
+            self.comm,
+        )
+        if counted is None:
+            self._waiting = PATIENT
+            return False
+        self._rest, (more, self.doubt) = tangent.D, counted
+        self.negative_pivots += more
+        return True
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""
@@ -174,6 +208,8 @@ class Factorisation:
 
             return applied
 
+        if self._rest:
+            return self.solve(rhs)  # K + D is symmetric
         assert self._pc is not None
         solve, times = of(self._pc.applyTranspose), of(self.matrix.multTranspose)
         return Edge(self._edged, self.comm, solve, times).solve(rhs) if self._edged else solve(rhs)
@@ -182,9 +218,16 @@ class Factorisation:
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
-        return np.array(y.array_r)
+        return np.array(y.array_r) + (self._rest.times(x) if self._rest else 0.0)
 
     def _inner(self, rhs: Vector) -> Vector:
+        """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""
+        rest = self._rest
+        if rest is None:
+            return self._back(rhs)
+        return solved(lambda v: self._back(rest.times(v)), self._back(rhs), self.comm)
+
+    def _back(self, rhs: Vector) -> Vector:
         """K^-1 rhs."""
         assert self._pc is not None
         assert self._rhs is not None

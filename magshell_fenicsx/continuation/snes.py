@@ -16,13 +16,14 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Direction, State, System, Weighted, followed, max_abs
+from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat
 
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
+DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
@@ -89,6 +90,7 @@ class Tangents:
         self.system, self._factorisation = system, factorisation
         self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and its number
         self._stressed = False  # whether it was factored with another stress than its own
+        self._rough = False  # whether a small part of it is that of an earlier state
 
     @property
     def state(self) -> State | None:
@@ -96,13 +98,24 @@ class Tangents:
         state, count = self._made
         return state if count == self._factorisation.count else None
 
-    def at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
-        """See `BorderedNewton.factor_at`."""
+    def at(self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Factorisation:
+        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state."""
         near, factors = self.state, self._factorisation
-        if near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm)):
-            factors.factor(self.system.tangent(state.u, state.mu, stress))
+        other = near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm))
+        if other or (self._rough and not rough):
+            self._rough = rough and factored_roughly(self.system, factors, state, stress)
+            if not self._rough:
+                factors.factor(self.system.tangent(state.u, state.mu, stress))
             self._made, self._stressed = (state, factors.count), bool(stress)
         return factors
+
+
+def factored_roughly(system: System, factors: Factorisation, state: State, stress: Sequence[Weighted] = ()) -> bool:
+    """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
+    if not (isinstance(system, Roughly) and system.dear and factors.doubt <= DOUBT):
+        return False
+    factors.factor(system.tangent(state.u, state.mu, stress, rough=True))
+    return factors.doubt <= DOUBT
 
 
 @dataclass(frozen=True)
@@ -265,7 +278,7 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
-        factors = self._tangents.at(state, self._stress)
+        factors = self._tangents.at(state, self._stress, rough=True)
         matrix = Bordered(self._system, factors, state, self._name, self._row)
         self._chord, step = Chord(matrix), matrix.solve(*f)
         steps.append(Step(matrix.size(step), own=True))

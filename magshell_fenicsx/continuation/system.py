@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +13,27 @@ Vector = NDArray[np.float64]  # the owned part of a distributed vector
 Amplitudes = Mapping[str, float]
 Weighted = tuple[float, Vector]
 Direction = tuple[Vector, float]  # (du, dmu)
+
+
+class Rest(Protocol):
+    """What is added to a sparse symmetric matrix, where all unknowns act on each other; it does not change."""
+
+    def times(self, v: Vector) -> Vector:
+        """Its product with a vector. Collective."""
+
+    def scaled(self, factor: float) -> "Rest":
+        """So many times this one."""
+
+    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
+        """The sum, with all entries; the matrix is reused by the next call. Collective."""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The symmetric matrix K + D, with all entries: K sparse, D mostly small beside it."""
+
+    K: PETSc.Mat
+    D: Rest
 
 
 @dataclass(frozen=True)
@@ -35,20 +56,20 @@ class Edged:
         Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no unstable direction.
     """
 
-    K: PETSc.Mat | Skewed
+    K: "PETSc.Mat | Beside | Skewed"
     C: Sequence[Vector]
     D: NDArray[np.float64]
     multipliers: int
 
 
-Tangent: TypeAlias = PETSc.Mat | Skewed | Edged
+Tangent: TypeAlias = PETSc.Mat | Beside | Skewed | Edged
 
 
 def symmetric_part(tangent: Tangent) -> PETSc.Mat:
-    """The symmetric matrix of u in a tangent, itself and no copy."""
+    """The symmetric matrix of u in a tangent, itself and no copy; with all entries where all unknowns are coupled."""
     while isinstance(tangent, Skewed | Edged):
         tangent = tangent.K
-    return tangent
+    return tangent.D.added_to(tangent.K) if isinstance(tangent, Beside) else tangent
 
 
 class System(Protocol):
@@ -94,6 +115,23 @@ class System(Protocol):
             Displacements with weights. A system may use the weighted sum of their stresses in place of the stress
             of u. That sum is linear along the path, while small errors of a guess u spoil its own stress.
         """
+
+
+@runtime_checkable
+class Roughly(Protocol):
+    """A system that may have a part of its tangent that is dear, and mostly small beside the others.
+
+    Attributes
+    ----------
+    dear
+        Whether it has one.
+    """
+
+    @property
+    def dear(self) -> bool: ...
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Tangent:
+        """As that of `System`; if `rough`, that part may be that of an earlier state."""
 
 
 def followed(u: Vector, step: Vector) -> list[Weighted]:

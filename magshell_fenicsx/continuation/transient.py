@@ -17,7 +17,18 @@ from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
 from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
 from magshell_fenicsx.continuation.snes import MOTION
-from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    Beside,
+    Edged,
+    Skewed,
+    State,
+    System,
+    Tangent,
+    Vector,
+    dot,
+    max_abs,
+)
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 FLOOR = 1e-3  # of the length: energies below that of such a displacement count as none
@@ -315,7 +326,7 @@ class Integrator:
         rate = rule.gamma / (rule.beta * dt)
         tangent = self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, Edged)
-        K = tangent.K if isinstance(tangent, Skewed) else tangent
+        K = tangent.K if isinstance(tangent, Skewed | Beside) else tangent
         if self._K is None:
             self._K = K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -323,7 +334,9 @@ class Integrator:
         self._K.scale(part)
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rate
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        whole = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        whole: Tangent = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        if isinstance(tangent, Beside):
+            whole = Beside(self._K, tangent.D.scaled(part))
         if self.device:
             C, D = self.device.edge(u, mu)
             self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))

@@ -13,6 +13,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.snes import factored_roughly
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models.shell import densities
@@ -73,7 +74,8 @@ class AntisymmetricModes:
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent of the antisymmetric modes at a symmetric state."""
         if self._factored is not state:
-            self._factorisation.factor(self.system.tangent(state.u, state.mu))
+            if not factored_roughly(self.system, self._factorisation, state):
+                self._factorisation.factor(self.system.tangent(state.u, state.mu))
             self._factored = state
         return self._factorisation
 

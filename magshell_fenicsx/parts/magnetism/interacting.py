@@ -50,7 +50,8 @@ class InteractionTerm:
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
-        self._cells, self._odd = CellsOfAll.of(V), False
+        self._cells = CellsOfAll.of(V)
+        self._even: InteractionTerm | None = None  # of an antisymmetric one the other
         unknowns = 3 * V.dofmap.index_map.size_global
         if unknowns > LARGEST:
             raise CaseError(
@@ -59,11 +60,12 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
+        self._stiff: tuple[Array, tuple[Array, Array]] | None = None  # deformed nodes and rows, also of odd additions
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""
         other = copy(self)
-        other._odd = True
+        other._even = self
         return other
 
     def refuse_near(self) -> None:
@@ -106,21 +108,38 @@ class InteractionTerm:
         """A sum over pairs of charges."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """It has no sparse part; see `add_rows`."""
+        """It has no sparse part; see `rows`."""
 
-    def add_rows(self, rows: Array, factor: float) -> None:
+    def rows(self, *, rough: bool = False) -> Array:
         """See `assembly.whole.WholeTerm`; collective."""
-        own, images = self._cells.own, self._copies.images
-        column_of = np.ascontiguousarray(np.tile(self._cells.nodes, (len(images), 1)), np.int64)
+        return self._even.both_rows(rough=rough)[1] if self._even else self.both_rows(rough=rough)[0]
+
+    def both_rows(self, *, rough: bool) -> tuple[Array, Array]:
+        """The rows, and those of additions to u that are opposite in the images; collective."""
+        nodes = self._nodes()
+        if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
+            self._stiff = None  # two are not kept at once
+            self._stiff = nodes, self._rows_at(nodes)
+        return self._stiff[1]
+
+    def _rows_at(self, nodes: Array) -> tuple[Array, Array]:
+        own, images, V = self._cells.own, self._copies.images, self._u.function_space
+        count, several = V.dofmap.index_map.size_global, len(images) > 1
+        column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
+        column_of[len(self._cells.nodes) :] += count  # those of images are apart
         row_of = np.full(column_of.shape, -1)
-        row_of[own.start : own.stop] = self._u.function_space.dofmap.list[: len(own)]
+        row_of[own.start : own.stop] = V.dofmap.list[: len(own)]
         turn = np.stack([image.Q for image in images])
-        turn[1:] *= -1.0 if self._odd else 1.0
-        stiffness = Stiffness(rows, factor * self._scale, row_of, column_of, turn)
+        local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
+        rows = np.zeros((local, 3, count * (1 + several), 3))
         try:
-            self._charged.evaluate(self._nodes(), own, stiffness)
+            self._charged.evaluate(nodes, own, Stiffness(rows, self._scale, row_of, column_of, turn))
         except Touching:
             rows[:] = np.nan
+        if not several:
+            return rows, rows
+        here, there = rows[:, :, :count], rows[:, :, count:]
+        return here + there, here - there
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""
@@ -140,7 +159,7 @@ class InteractionTerm:
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen = given, None
+            self._given, self._seen, self._stiff = given, None, None
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])
