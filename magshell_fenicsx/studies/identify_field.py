@@ -79,7 +79,7 @@ class RemanenceField:
         assert prior
         shape = (len(self.start), len(self.free))
         low, high = (v[block].reshape(shape) for v in fit.band)
-        kept = np.trace(fit.covariance[block, block] @ prior.rows.T @ prior.rows)
+        kept = np.trace(fit.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
             "components": self.names,

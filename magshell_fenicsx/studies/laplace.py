@@ -133,6 +133,13 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def local(self) -> Array:
+        """(p, p) covariance for noise and strengths of a field as they are at the fit."""
+        if not self.known.field:
+            return self.covariance
+        return _covariance(self.known.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation)
+
+    @property
     def correlation(self) -> Array:
         """(p, p)."""
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
@@ -388,6 +395,7 @@ def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:
     -------
     It, and at how many of these places nothing is predicted.
     """
+    fit = replace(fit, covariance=fit.local)
     size = fit.deviation
     spread, axes = np.linalg.eigh(fit.correlation)
     worst, lost = 0.0, 0
