@@ -40,7 +40,7 @@ def draw_identified(
     panels = list[Callable[[Any], None]]()
     rows, shape, field = content["rows"], content["shape"], content["remanence"]
     of_shape = [row for row in rows if row["result"].startswith(OF_POINTS)]
-    if len({row["column"] for row in of_shape}) > 1 and len({(row["settings"], row["at"]) for row in of_shape}) == 1:
+    if len({row["column"] for row in of_shape}) > 1:
         panels.append(partial(_shape, rows=of_shape, shape=shape))
         rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
     ordered = sorted(rows, key=lambda row: str(row["column"]))
@@ -62,22 +62,32 @@ def draw_identified(
 
 def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:
     """Where the places of a shape are, in the two directions in which most of them move."""
-    moved = dict[str, dict[str, Row]]()
+    far = dict[str, float]()
     for row in rows:
-        moved.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
-    both = sorted(sorted(moved, key=lambda name: -max(abs(row["measured"]) for row in moved[name].values()))[:2])
-    points = [name for name in shape if all(name in moved[axis] for axis in both)]
-    at = [[shape[name]["xyz".index(axis[1])] for name in points] for axis in both]
-    for kind, style in (("predicted", "-"), ("measured", ".")):
-        u = [[moved[axis][name][kind] for name in points] for axis in both]
-        label = "fitted" if kind == "predicted" else kind
-        plot.plot(*(np.array(at) + np.array(u)), style if _in_line(at) else ".", label=label, zorder=4, lw=1.2)
+        far[row["column"]] = max(far.get(row["column"], 0.0), abs(row["measured"]))
+    both, labelled = sorted(sorted(far, key=lambda name: -far[name])[:2]), False
+    for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
+        moved = dict[str, dict[str, Row]]()
+        for row in of_shape:
+            moved.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
+        points = [name for name in shape if all(name in moved.get(axis, {}) for axis in both)]
+        at = [[shape[name]["xyz".index(axis[1])] for name in points] for axis in both]
+        for kind, style, colour in (("predicted", "-", "C0"), ("measured", ".", "C1")):
+            u = [[moved[axis][name][kind] for name in points] for axis in both]
+            label = "" if labelled else "fitted" if kind == "predicted" else kind
+            line = style if _in_line(at) else "."
+            plot.plot(*(np.array(at) + np.array(u)), line, color=colour, label=label, zorder=4, lw=1.2)
+        labelled = True
     plot.plot(*at, "--" if _in_line(at) else ".", color="0.6", lw=0.8, label="undeformed", zorder=1)
     unit = split_unit(rows[0]["result"])
     labels = [f"${axis[1]}$" + (f"  ({unit[1]})" if unit else "") for axis in both]
     plot.set(xlabel=labels[0], ylabel=labels[1])
     plot.set_aspect("equal", adjustable="datalim")
     plot.legend(frameon=False, fontsize=8)
+
+
+def _which(row: Row) -> tuple[str, str]:
+    return str(row["settings"]), str(row["at"])
 
 
 def _in_line(at: Sequence[Sequence[float]]) -> bool:
