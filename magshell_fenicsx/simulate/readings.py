@@ -8,13 +8,14 @@ There the equilibrium is solved, and a result y has the derivative
 with dmu/dp of the load that keeps the place: where its unit depends on p, as the buckling pressure does on a thickness.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.point import Point
@@ -39,6 +40,9 @@ Array = NDArray[np.float64]
 STEP = 1e-4  # of what a change of a number is small against
 SAME = 1e-6  # relative difference of rates that are the same
 SLACK = 1e-9  # relative; a place so far beyond the path is its end
+
+
+ByField = Callable[[FieldGradient], Array]
 
 
 class Outside(Lost):
@@ -195,14 +199,15 @@ class Read:
 
     def curve(self, of: str, *, change: bool = False) -> list[tuple[float, float]]:
         """Places and values of a column at the points of the last step."""
-        found, begun = list[tuple[float, float]](), 0.0
-        for record in self._way():
-            state = record.point.state
-            row = self.scene.observe(state)
-            value = {**row, **self.scene.sizes.values(row)}[of]
-            begun = value if not found and change else begun
-            found.append((self.places.of(state), float(value) - begun))
-        return found
+        begun = float(self._observed[0][1][of]) if change else 0.0
+        return [(place, float(row[of]) - begun) for place, row in self._observed]
+
+    @cached_property
+    def _observed(self) -> list[tuple[float, dict[str, float]]]:
+        """Places and rows of the points of the last step."""
+        states = [record.point.state for record in self._way()]
+        rows = [(state, self.scene.observe(state)) for state in states]
+        return [(self.places.of(state), {**row, **self.scene.sizes.values(row)}) for state, row in rows]
 
     def adjoint(self, reading: Reading) -> Adjoint:
         """That of a reading, not of a change.
@@ -289,7 +294,14 @@ class Read:
         return min(low, high) - slack <= place <= max(low, high) + slack
 
 
-def read(scene: Scene, wanted: Sequence[Reading], keys: Sequence[str], *, slopes: bool = True) -> Readings:
+def read(
+    scene: Scene,
+    wanted: Sequence[Reading],
+    keys: Sequence[str],
+    *,
+    slopes: bool = True,
+    fields: Mapping[str, tuple[int, ByField]] | None = None,
+) -> Readings:
     """Follow the path of a scene and read results on it; collective.
 
     Parameters
@@ -298,6 +310,9 @@ def read(scene: Scene, wanted: Sequence[Reading], keys: Sequence[str], *, slopes
         Numbers of the case that results are differentiated by.
     slopes
         Whether they are; else slopes are zero.
+    fields
+        Fields that they are differentiated by too (see `gradients.gradient`) -> how many numbers they have, and
+        what makes the derivatives by these of a gradient; they follow those by keys.
 
     Raises
     ------
@@ -311,12 +326,17 @@ def read(scene: Scene, wanted: Sequence[Reading], keys: Sequence[str], *, slopes
     found = [path.adjoint(each) for each in wanted] + [path.adjoint_at(path.begin, of) for of in changed]
     placed = [each.at is not None for each in wanted] + [True for _ in changed]
     values = np.array([each.shown for each in found])
-    by = np.zeros((len(found), len(keys)))
+    by = np.zeros((len(found), len(keys) + sum(count for count, _ in (fields or {}).values())))
     for i, key in enumerate(keys if slopes else ()):
         by[:, i] = path.slopes(found, key, placed)
+    begun = len(keys)
+    for field_name, (count, of_field) in (fields or {}).items() if slopes else ():
+        for row, each in zip(by, found, strict=True):
+            row[begun : begun + count] = of_field(derivative(each, field_name))  # type: ignore[arg-type]
+        begun += count
     for i, reading in enumerate(wanted):
         if reading.change:
-            begun = len(wanted) + changed.index(reading.of)
-            values[i], by[i] = values[i] - values[begun], by[i] - by[begun]
+            at_begin = len(wanted) + changed.index(reading.of)
+            values[i], by[i] = values[i] - values[at_begin], by[i] - by[at_begin]
     curves = {each.of: path.curve(each.of, change=each.change) for each in wanted if each.at is not None}
     return Readings(values[: len(wanted)], by[: len(wanted)], curves)

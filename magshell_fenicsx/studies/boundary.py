@@ -48,6 +48,8 @@ FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"),
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
 ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+WAVES = "m = "
+SAME = 1e-2  # of the load: an instability of two models
 SPECIAL = ("cusp", "turn", "meeting")
 SAID = {
     "cusp": "a cusp, where two folds are born",
@@ -187,11 +189,14 @@ def boundary(
         journal = partial(_Journal, folder / "points", _identity(source, span, made, begun_at.text))
         value = _value(source, span, made, outside=not start)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
-        if begin["mode"] == "antisymmetric":
-            once("the instability is antisymmetric: the whole shell is modelled")
-            override(source, "symmetry=none")
-            again = begun_at.anywhere()
+        if begin["mode"] == "antisymmetric" or begin["mode"].startswith(WAVES):
+            mode, setting, what = begin["mode"], *_larger(source, begin["mode"], made)
+            once(f"the instability is {mode}: {what} is modelled")
+            override(source, setting)
+            again, of_mode = begun_at.anywhere(), begin
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
+            if begin["label"] and mode.startswith(WAVES) and setting != "symmetry=none":
+                begin = _same(of_mode, begin)
         if not begin["label"]:
             instability([])
         refuse_excluded(begin["mode"])
@@ -212,6 +217,38 @@ def boundary(
     for line in done.content["said"]:
         once(line)
     return done
+
+
+def _larger(source: Source, mode: str, made: Made) -> tuple[str, str]:
+    """The setting of the smallest model that has a mode, and what it is: of m waves a sector if the case has one."""
+    if mode.startswith(WAVES):
+        m = int(mode.removeprefix(WAVES))
+        sector, setting = copy.deepcopy(source), f"symmetry={m}"
+        override(sector, setting)
+        try:
+            made(sector).problem()
+        except CaseError:
+            pass
+        else:
+            return setting, f"the sector of {180 / m:.4g} degrees between two mirror planes"
+    return "symmetry=none", "the whole shell"
+
+
+def _same(of_meridian: dict[str, Any], of_sector: dict[str, Any]) -> dict[str, Any]:
+    """The instability of a sector, if it is the waves of the meridian.
+
+    Raises
+    ------
+    CaseError
+        If it is another one.
+    """
+    one, two = of_meridian["value"], of_sector["value"]
+    if of_sector["label"] != "bifurcation" or abs(two - one) > SAME * abs(one):
+        raise CaseError(
+            f"the sector first loses its stability at {two:.6g}, where the meridian has {of_meridian['mode']} at "
+            f"{one:.6g}: take a finer mesh, or symmetry: none"
+        )
+    return of_sector | {"mode": "", "waves": of_meridian["mode"]}
 
 
 def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
@@ -339,6 +376,7 @@ def _begin(
     outcome = {
         "label": located.label,
         "mode": located.mode,
+        "waves": "",
         "amplitude": located.amplitude,
         "step": located.step,
         "value": state.mu[located.amplitude],
@@ -362,6 +400,7 @@ def _followed(
         varied = Varied(scene, record, partial(_problem, source, span, made), value, span.ends)
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
+    varied.mode = varied.mode or begin["waves"]
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     curve = Boundary(varied, varied.name, varied.kind, scales, own.recorded)
     rows: list[dict[str, Any]] = []
@@ -424,7 +463,7 @@ def _put_together(
         "to": span.last,
         "load": begin["amplitude"],
         "kind": begin["label"],
-        "mode": begin["mode"],
+        "mode": begin["mode"] or begin["waves"],
         "points": len(rows),
         "special": special,
         "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],

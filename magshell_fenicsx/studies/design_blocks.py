@@ -74,6 +74,14 @@ class Number(Bounded):
         section[int(last) if isinstance(section, list) else last] = f"{value:.15g} {self.unit}" if self.unit else value
 
 
+def by_components(scene: Scene, by: FieldGradient) -> Array:
+    """The derivatives by the components of the remanence at its points; collective."""
+    magnetic = scene.problem.loads.magnetic
+    assert magnetic
+    assert isinstance(magnetic.remanent, ByControls)
+    return np.asarray(by.field.function_space.mesh.comm.allreduce(magnetic.remanent.pulled(by.places, by.forces)))
+
+
 @dataclass(frozen=True)
 class Vectors:
     """The remanence at points, of which each place has the mean.
@@ -126,11 +134,7 @@ class Vectors:
     def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
         if not isinstance(by := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
-        magnetic = scene.problem.loads.magnetic
-        assert magnetic
-        assert isinstance(magnetic.remanent, ByControls)
-        comm = by.field.function_space.mesh.comm
-        forces = comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
+        forces = by_components(scene, by)
         return np.concatenate([np.sum(forces * way, axis=1) for way in self._polar(x)[1]])
 
     def _polar(self, x: Array) -> tuple[Array, list[Array]]:

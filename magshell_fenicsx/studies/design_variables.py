@@ -214,7 +214,7 @@ def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tu
 
 def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     """The vectors of the remanence that vary."""
-    controls, start = _controls(case, section)
+    controls, start = controls_of(case, section.points, section.filter, "design.remanence")
     sizes, lengths = np.linalg.norm(start, axis=1), section.magnitude
     if lengths is None:
         return Vectors(controls, start, None)
@@ -227,21 +227,27 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     return Vectors(controls, start, (low, high))
 
 
-def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]:
-    """The points of the remanence, and its vectors there at the start."""
-    magnetic, count, width = case.magnetic, section.points, section.filter
+def controls_of(case: Case, count: int | None, width: float | None, where: str) -> tuple[Controls, Array]:
+    """The points of the remanence, and its vectors there as the case has them.
+
+    Raises
+    ------
+    CaseError
+        If there is no remanence, or none at points where no number of points is given; it begins with the key `where`.
+    """
+    magnetic = case.magnetic
     if magnetic is None or magnetic.remanent is None or not case.lambda_m:
-        raise CaseError("design.remanence: the case has no remanence in a field, so no result depends on it")
+        raise CaseError(f"{where}: the case has no remanence in a field, so no result depends on it")
     if count is None:
         if not (magnetic.remanent and magnetic.remanent.file):
-            raise CaseError("design.remanence: give points, or magnetic.remanent of kind: points")
+            raise CaseError(f"{where}: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files)
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
     problem = case.problem()
     places, width = _spread(case, problem, count, width)
     field = magnetisation(magnetic, case.context, 0.0, problem.within)
     if field.patches is not None:
-        raise CaseError("design.remanence.points: the remanence starts by patches of a mesh: start from another kind")
+        raise CaseError(f"{where}.points: the remanence starts by patches of a mesh: start from another kind")
     if callable(field.remanent):
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])

@@ -3,10 +3,8 @@
 Every evaluation is kept: an identification that is started again takes those in its folder and goes on.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,118 +12,42 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
-from magshell_fenicsx.input.source import CaseError, Source, override, read_source
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.simulate.gradients.instabilities import Lost
-from magshell_fenicsx.simulate.readings import Outside, Reading, read
+from magshell_fenicsx.simulate.readings import Reading
 from magshell_fenicsx.simulate.record import Stopped
-from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.studies.design_blocks import Number
-from magshell_fenicsx.studies.identify_data import Names, Parameter, Table, candidate, parameters_of, table_of
+from magshell_fenicsx.studies.identify_data import (
+    OF_POINTS,
+    Names,
+    Parameter,
+    Table,
+    candidate,
+    parameters_of,
+    table_of,
+    with_shape,
+)
+from magshell_fenicsx.studies.identify_field import NAME, field_of, flux_density
 from magshell_fenicsx.studies.identify_picture import draw_identified
+from magshell_fenicsx.studies.identify_predicted import Predictor
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
 from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
 from magshell_fenicsx.studies.points import identity, short
-from magshell_fenicsx.studies.runner import Folder, Made, Say, keep, kept
+from magshell_fenicsx.studies.runner import Folder, Made, Say
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
-    "an identification", ("identify.json", "identify.csv", "identify.png"), ("case", "parameters", "predicted")
+    "an identification",
+    ("identify.json", "identify.csv", "identify.png", "remanence.csv"),
+    ("case", "parameters", "predicted"),
 )
 NOTHING = 1e-9  # change of a result over that of a parameter, both relative: it has no influence
-Settings = tuple[str, ...]
-
-
-@dataclass
-class Seen:
-    """What is predicted for a vector of parameters; with a note there is nothing.
-
-    Attributes
-    ----------
-    values, slopes
-        (n,) and (n, p), in the units of data and parameters.
-    curves
-        Result -> places and values along the path, of the case without settings of rows.
-    invalid
-        Whether there is nothing as data are outside the path, or the case is none.
-    """
-
-    values: list[float] = field(default_factory=list)
-    slopes: list[list[float]] = field(default_factory=list)
-    curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    note: str = ""
-    invalid: bool = False
-
-
-@dataclass
-class Predictor:
-    """Predicts readings for vectors of parameters; collective.
-
-    Attributes
-    ----------
-    readings
-        Settings of the case -> what is read there.
-    """
-
-    source: Source
-    made: Made
-    parameters: Sequence[Parameter]
-    readings: dict[Settings, list[Reading]]
-    folder: Path
-    mark: str
-    comm: MPI.Comm
-    count: int = 0
-
-    def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
-        """What is predicted, known or new."""
-        x = np.array(self.comm.bcast(x))
-        listed = json.dumps([[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()])
-        text = f"{self.mark} {listed} {slopes}".encode()
-        file = self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
-        known = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
-        if known is None:
-            known = Seen(**self.comm.bcast(asdict(self._new(x, slopes))))
-            self.count += 1
-            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(known)}))
-        return known
-
-    def _new(self, x: Array, slopes: bool) -> Seen:
-        seen = Seen()
-        for settings, wanted in self.readings.items():
-            try:
-                found = read(self._scene(x, settings), wanted, [each.key for each in self.parameters], slopes=slopes)
-            except (Lost, CaseError, MeshError) as e:
-                note = f"{', '.join(settings)}: {e}" if settings else str(e)
-                return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
-            seen.values += [float(v) for v in found.values]
-            sizes = [each.number.gradient(x, None, {each.key: 1.0})[0] for each in self.parameters]  # type: ignore[arg-type]
-            seen.slopes += (found.slopes * sizes).tolist()
-            seen.curves = seen.curves or found.curves
-        return seen
-
-    def _scene(self, x: Array, settings: Settings) -> Scene:
-        source = varied(self.source, [each.number for each in self.parameters], x)
-        for setting in settings:
-            override(source, setting)
-        return Scene(self.made(source).problem(), self.comm)
-
-
-def varied(source: Source, numbers: Sequence[Number], x: Array) -> Source:
-    """The source of a case with other numbers."""
-    data = json.loads(json.dumps(source.data))
-    data.pop("identify", None)
-    for number, value in zip(numbers, x, strict=True):
-        number.put(data, np.array([value]))
-    return Source(source.name, data, folder=source.folder, files=source.files)
 
 
 @dataclass(frozen=True)
@@ -148,6 +70,12 @@ class Identified:
         """Key -> value, deviation, low and high of its 95 % band, unit, and its prior."""
         return dict(self.content["parameters"])
 
+    @property
+    def remanence(self) -> dict[str, Any] | None:
+        """Of the field that was looked for: places over R, values over |B^r|, deviations and bands, and its prior."""
+        found: dict[str, Any] | None = self.content["remanence"]
+        return found
+
 
 def identify(
     file: Path | str,
@@ -166,7 +94,8 @@ def identify(
     data
         A CSV file; see `IdentifySection`.
     out
-        Folder of identify.json, identify.csv (data, predictions and bands), identify.png and points/.
+        Folder of identify.json, identify.csv (data, predictions and bands), identify.png and points/; of a field also
+        remanence.csv, its vectors.
     made
         Makes a case of its source, the same on all ranks.
 
@@ -185,17 +114,20 @@ def identify(
         raise CaseError(f"{file}: identify: is missing: it says which parameters are looked for")
     try:
         parameters = parameters_of(source, case, section)
-        table = from_first(comm, lambda: table_of(Path(data), case, section))
+        field, wider = field_of(source, case, section.remanence, len(parameters))
+        wider, rows, shape = from_first(comm, lambda: with_shape(Path(data), wider))
+        case = made(wider)
+        table = from_first(comm, lambda: table_of(Path(data), case, section, rows, shape))
         names = Names(case)
         others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
         _refuse_few(table, parameters)
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
             mark = identity(case) + repr([each.key for each in parameters])
-            predictor = Predictor(source, made, parameters, dict(table.readings), folder, mark, comm)
-            done, drawn = _identified(predictor, section, table, others, once)
+            predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field)
+            done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
-            by_first(comm, lambda: _write(done, drawn, folder))
+            by_first(comm, lambda: _write(done, drawn, folder, predictor))
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
     for line in done.content["said"]:
@@ -239,14 +171,18 @@ def _identified(
     table: Table,
     others: Sequence[tuple[Reading, str, float]],
     say: Say,
+    over: tuple[float, str],
 ) -> tuple[Identified, Callable[[Path], None]]:
-    parameters = predictor.parameters
-    start = np.array([each.start for each in parameters])
-    prior = np.array([[each.mean, each.deviation] for each in parameters]).T
+    parameters, field = predictor.parameters, predictor.field
+    numbers = field.first if field else np.zeros(0)
+    start = np.array([*(each.start for each in parameters), *numbers])
+    mean = np.array([*(each.mean for each in parameters), *numbers])
+    deviation = np.array([*(each.deviation for each in parameters), *np.full(numbers.size, np.inf)])
     noise = np.array([column.noise for column in table.columns])
-    known = Measured(table.data, table.column, noise, *prior)
-    finite = np.where(np.isfinite(prior[1]), prior[1], np.abs(start))
+    known = Measured(table.data, table.column, noise, mean, deviation, field.smooth if field else None)
+    finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
     size = np.where(finite > 0, finite, 1.0)
+    size[len(parameters) :] = 1.0
     first = predictor(start)
     if first.note:
         raise (CaseError if first.invalid else Stopped)(f"the case itself does not predict the data: {first.note}")
@@ -271,18 +207,22 @@ def _identified(
         ) from None
     except NoNoise as e:
         raise _no_noise(table, e.column, len(parameters)) from None
-    bent, lost = nonlinearity(partial(model, slopes=False), known, fit)
-    content = _content(predictor, section, table, known, fit)
+    bent, lost = nonlinearity(partial(model, slopes=False), fit)
+    content = _content(predictor, table, fit)
+    content["remanence"] = field.found(fit, over) if field else None
     content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
     content["predicted"], content["next"] = _others(predictor, section, fit, others)
     content["evaluations"] = predictor.count
-    content["said"] = sentences(content, fit, known, table)
+    content["said"] = sentences(content, fit, table)
     drawn = partial(draw_identified, content, _curves(predictor, table, fit))
     return Identified(content, fit), drawn
 
 
 def _said(parameters: Sequence[Parameter], x: Array) -> str:
-    return ", ".join(f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=True))
+    said = [f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=False)]
+    if len(x) > len(parameters):
+        said.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
+    return ", ".join(said)
 
 
 def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]) -> None:
@@ -294,12 +234,16 @@ def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence
         With the name of one that does not.
     """
     strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
-    if idle := [p.key for p, change in zip(parameters, strongest, strict=True) if change < NOTHING]:
+    of_field = strongest[len(parameters) :]
+    changes = [*zip([p.key for p in parameters], strongest, strict=False), (NAME, of_field.max(initial=np.inf))]
+    changes = changes if of_field.size else changes[:-1]
+    if idle := [key for key, change in changes if change < NOTHING]:
         raise CaseError(f"identify.parameters: {', '.join(idle)}: has no influence on these data where the case starts")
 
 
-def _content(predictor: Predictor, section: IdentifySection, table: Table, known: Measured, fit: Fit) -> dict[str, Any]:
+def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
     """What is found, as plain data."""
+    known = fit.known
     low, high = fit.band
     far = fit.quantiles(np.eye(len(fit.x)))
     found = {
@@ -322,6 +266,7 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
     rows = [
         {
             "result": each.of,
+            "column": table.columns[table.column[i]].header,
             "settings": "; ".join(settings),
             "at": "end" if each.at is None else each.at,
             "measured": float(table.data[i]),
@@ -349,6 +294,7 @@ def _content(predictor: Predictor, section: IdentifySection, table: Table, known
         "covariance": fit.covariance.tolist(),
         "noise": noise,
         "places": table.places,
+        "shape": dict(table.shape),
         "misfit_over_noise": float(np.sqrt(np.mean(((known.data - fit.y) / s) ** 2))),
         "steps": fit.steps,
         "ended": fit.ended,
@@ -364,8 +310,10 @@ def _others(
     if not others:
         return [], None
     keys = [each.key for each in predictor.parameters]
+    deviations = _named(keys, fit.deviation)
     size = np.where(fit.x != 0, np.abs(fit.x), 1.0)
-    chosen = keys.index(section.narrow) if section.narrow else int(np.argmax(fit.deviation / size))
+    relative = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
+    chosen = section.narrow or (max(relative, key=relative.__getitem__) if keys else NAME)
     found = list[dict[str, Any]]()
     for reading, unit, noise in others:
         alone = Predictor(
@@ -376,6 +324,7 @@ def _others(
             predictor.folder,
             predictor.mark,
             predictor.comm,
+            predictor.field,
         )
         seen, row = (
             alone(fit.x),
@@ -387,30 +336,40 @@ def _others(
             continue
         slope = np.array(seen.slopes[0])
         value, half = seen.values[0], float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0])
-        narrowed = {key: float(v) for key, v in zip(keys, fit.narrowed(slope, noise), strict=True)}
+        narrowed = _named(keys, fit.narrowed(slope, noise))
         low, high = value - half, value + half
         found.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
     there = [each for each in found if "value" in each]
     if not there:
         return found, None
-    best = min(there, key=lambda each: each["deviations_then"][keys[chosen]])
-    then = best["deviations_then"][keys[chosen]]
-    how = {"parameter": keys[chosen], "from": float(fit.deviation[chosen]), "to": then}
+    best = min(there, key=lambda each: each["deviations_then"][chosen])
+    how = {"parameter": chosen, "from": deviations[chosen], "to": best["deviations_then"][chosen]}
     return found, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
+
+
+def _named(keys: Sequence[str], deviations: Array) -> dict[str, float]:
+    """Deviations by keys; of a field their root mean square."""
+    of_field = deviations[len(keys) :]
+    own = {NAME: float(np.sqrt(np.mean(of_field**2)))} if of_field.size else {}
+    return {key: float(v) for key, v in zip(keys, deviations, strict=False)} | own
 
 
 def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tuple[float, float]]]:
     """Result -> the path at the fit, as far as data go."""
     seen, found = predictor(fit.x), dict[str, list[tuple[float, float]]]()
     for of, curve in seen.curves.items():
+        if of.startswith(OF_POINTS):
+            continue
         places = [r.at for each in table.readings.values() for r in each if r.of == of and r.at is not None]
         upto = next((i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))), len(curve) - 1)
         found[of] = curve[: upto + 1]
     return found
 
 
-def _write(done: Identified, drawn: Callable[[Path], None], folder: Path) -> None:
+def _write(done: Identified, drawn: Callable[[Path], None], folder: Path, predictor: Predictor) -> None:
     write_object(folder / "identify.json", done.content)
     rows = done.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")
     drawn(folder / "identify.png")
+    if predictor.field:
+        predictor.field.write(done.fit.x[len(predictor.parameters) :], folder / "remanence.csv")

@@ -1,8 +1,8 @@
 """What `magshell identify` is given: measured columns as readings of a case, and numbers of it with their priors."""
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ from magshell_fenicsx.studies.runner import Case
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*([\w.]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 MOST_READINGS = 10_000
+SHAPE, MOVED = ("x", "y", "z"), ("ux", "uy", "uz")  # columns of a shape: places, and what they are displaced by
+OF_POINTS = "measured_"  # names of these places in the case
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Table:
         (n,) the numbers in the case's units, and which column each is of.
     places
         The column of the places; "" without.
+    shape
+        Name of a place of the shape -> where it is on the undeformed shell, in the unit of its displacements.
     """
 
     columns: tuple[Column, ...]
@@ -92,6 +96,7 @@ class Table:
     data: Array
     column: NDArray[np.int64]
     places: str
+    shape: Mapping[str, list[float]] = field(default_factory=dict)
 
 
 class Names:
@@ -155,7 +160,7 @@ class Names:
             If no result has it.
         """
         units = [q.name for of in self._bare if (q := self.scene.sizes.column(of))]
-        names = [*self._bare, *units, *FOLDS, *(of.rpartition("_")[0] for of in FOLDS if of in SCALES)]
+        names = [*self._bare, *units, *FOLDS, *(of.rpartition("_")[0] for of in FOLDS if of in SCALES), *MOVED]
         if name not in names and not NAMES.fullmatch(name):
             raise CaseError(f"{where}: {name}: the case has no such result; allowed are {', '.join(names)}")
 
@@ -230,41 +235,92 @@ def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
         raise CaseError(f"{_text(amount)}: the case gives {key} with {what}: so has its prior") from None
 
 
-def table_of(file: Path, case: Case, section: IdentifySection) -> Table:
-    """The measured columns.
+def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str, list[float]]]:
+    """The case with the places of a measured shape as named points.
+
+    Returns
+    -------
+    It, the name of each row's place, and where these are in the file's unit; the case itself and nothing without them.
+
+    Raises
+    ------
+    CaseError
+        If there are places without displacements, or these without places.
+    """
+    columns, units = _columns(file)
+    where, there = f"--data {file}", [name for name in SHAPE if name in columns]
+    if not there:
+        return source, [], {}
+    if len(there) < len(SHAPE) or not any(name in columns for name in MOVED):
+        raise CaseError(f"{where}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} one or more")
+    rows: list[list[float]] = [list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])]
+    if not np.isfinite(rows).all():
+        raise CaseError(f"{where}: {', '.join(SHAPE)}: has a row without a number")
+    chosen = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
+    shape = {chosen[tuple(row)]: row for row in rows}
+    texts = {
+        name: [f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)]
+        for name, row in shape.items()
+    }
+    data = {**source.data, "points": {**(source.data.get("points") or {}), **texts}}
+    varied = Source(source.name, data, source.places, source.folder, source.files)
+    return varied, [chosen[tuple(row)] for row in rows], shape
+
+
+def _columns(file: Path) -> tuple[dict[str, Array], dict[str, str | None]]:
+    try:
+        return read_table(file, Files())
+    except TableError as e:
+        raise CaseError(f"--data {file}: {e}") from None
+
+
+def table_of(
+    file: Path,
+    case: Case,
+    section: IdentifySection,
+    rows: Sequence[str] = (),
+    shape: Mapping[str, list[float]] | None = None,
+) -> Table:
+    """The measured columns; the points of the rows and their places are those of `with_shape`.
 
     Raises
     ------
     CaseError
         If a column is no result, has no unit, or the section names one that is not there.
     """
-    try:
-        columns, units = read_table(file, Files())
-    except TableError as e:
-        raise CaseError(f"--data {file}: {e}") from None
+    columns, units = _columns(file)
     names, where = Names(case), f"--data {file}"
     at: Array = np.full(0, np.nan)
     keys, results = dict[str, tuple[str, Array]](), list[tuple[Column, Array]]()
-    places = ""
+    places = length = ""
     for header, values in columns.items():
         parts = HEADER.fullmatch(header)
         name, unit = (parts[1], parts[2] or units[header]) if parts else (header, None)
         if "." in name:
             keys[name] = (unit or "", values)
             continue
-        of, own, factor = names.of(name, unit, where)
+        if rows and name in SHAPE:
+            continue
+        moved = bool(rows) and name in MOVED
+        of, own, factor = names.of(f"{rows[0]}_{name}" if moved else name, unit, where)
         if names.places and of == names.places.column:
             at, places = values * factor, of
             continue
         noise = section.noise.get(name, section.noise.get(of))
         known = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
+        of = of.removeprefix(rows[0]) if moved else of
+        length = own if moved else length
         if noise is not None and not known > 0:
             raise CaseError(f"identify.noise.{name}: must be positive, here {_text(noise)}")
         results.append((Column(name, of, own, known), values * factor))
     if not results:
         raise CaseError(f"{where}: has no column with a result of this case")
     _refuse_unknown(section, [each for each, _ in results], where)
-    return _listed(results, keys, at, places, section, where)
+    table = _listed(results, keys, at, places, section, where, rows)
+    sizes = [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE] if shape else []
+    return replace(
+        table, shape={name: [a * b for a, b in zip(at, sizes, strict=True)] for name, at in (shape or {}).items()}
+    )
 
 
 def _refuse_unknown(section: IdentifySection, columns: Iterable[Column], where: str) -> None:
@@ -281,6 +337,7 @@ def _listed(
     places: str,
     section: IdentifySection,
     where: str,
+    points: Sequence[str],
 ) -> Table:
     """Rows as readings, those of the same settings together; what is no number was not measured."""
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
@@ -294,7 +351,8 @@ def _listed(
                 continue
             bound = place is not None and own.of not in FOLDS and not NAMES.fullmatch(own.of) and own.of != "barrier"
             change = own.of in section.changes or own.header in section.changes
-            readings.setdefault(settings, []).append(Reading(own.of, place if bound else None, change))
+            of = f"{points[row]}{own.of}" if own.of.startswith("_") else own.of
+            readings.setdefault(settings, []).append(Reading(of, place if bound else None, change))
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
     flat = np.array([value for each in data.values() for value in each])

@@ -1,6 +1,8 @@
 """The picture of an identification: data and prediction with their bands, and what is known of the parameters."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -8,16 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.naming import key_words, result_label
+from magshell_fenicsx.studies.identify_data import OF_POINTS
+from magshell_fenicsx.studies.naming import key_words, result_label, split_unit
 
 Row = Mapping[str, Any]
 Array = NDArray[np.float64]
+POINT = re.compile(rf"{OF_POINTS}\d+")
+AXES = {"bx": "x", "by": "y", "bz": "z", "b_rho": r"\rho", "b_z": "z"}
 
 
 def draw_identified(
     content: Mapping[str, Any], curves: Mapping[str, Sequence[tuple[float, float]]], file: Path
 ) -> None:
-    """Draw each column of the data over its places, and the parameters before and after.
+    """Draw each column of the data over its places, a shape from the side, a field with its bands, and the parameters
+    before and after.
 
     Parameters
     ----------
@@ -31,16 +37,86 @@ def draw_identified(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = sorted(content["rows"], key=lambda row: str(row["result"]))
-    columns = {of: list(own) for of, own in groupby(rows, key=lambda row: str(row["result"]))}
-    count = len(columns) + 1
-    figure, plots = plt.subplots(1, count, figsize=(4.2 * count, 3.6), layout="constrained")
-    for plot, (of, own) in zip(plots, columns.items(), strict=False):
-        _data(plot, of, own, curves.get(of, ()), content)
-    _parameters(plots[-1], content["parameters"])
+    panels = list[Callable[[Any], None]]()
+    rows, shape, field = content["rows"], content["shape"], content["remanence"]
+    of_shape = [row for row in rows if row["result"].startswith(OF_POINTS)]
+    if len({row["column"] for row in of_shape}) > 1:
+        panels.append(partial(_shape, rows=of_shape, shape=shape))
+        rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
+    ordered = sorted(rows, key=lambda row: str(row["column"]))
+    for _, own in groupby(ordered, key=lambda row: str(row["column"])):
+        column = list(own)
+        of = column[0]["result"].partition(OF_POINTS)[0] or column[0]["column"]
+        panels.append(partial(_data, of=of, rows=column, curve=curves.get(of, ()), content=content))
+    if field:
+        panels += [partial(_field, field=field, number=i) for i in range(len(field["components"]))]
+    if content["parameters"]:
+        panels.append(partial(_parameters, parameters=content["parameters"]))
+    figure, plots = plt.subplots(1, len(panels), figsize=(4.2 * len(panels), 3.6), layout="constrained", squeeze=False)
+    for plot, panel in zip(plots[0], panels, strict=True):
+        panel(plot)
     figure.suptitle(content["case"])
     figure.savefig(file, dpi=200)
     plt.close(figure)
+
+
+def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:
+    """Where the places of a shape are, in the two directions in which most of them move."""
+    far = dict[str, float]()
+    for row in rows:
+        far[row["column"]] = max(far.get(row["column"], 0.0), abs(row["measured"]))
+    both, labelled = sorted(sorted(far, key=lambda name: -far[name])[:2]), False
+    for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
+        moved = dict[str, dict[str, Row]]()
+        for row in of_shape:
+            moved.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
+        points = [name for name in shape if all(name in moved.get(axis, {}) for axis in both)]
+        at = [[shape[name]["xyz".index(axis[1])] for name in points] for axis in both]
+        for kind, style, colour in (("predicted", "-", "C0"), ("measured", ".", "C1")):
+            u = [[moved[axis][name][kind] for name in points] for axis in both]
+            label = "" if labelled else "fitted" if kind == "predicted" else kind
+            line = style if _in_line(at) else "."
+            plot.plot(*(np.array(at) + np.array(u)), line, color=colour, label=label, zorder=4, lw=1.2)
+        labelled = True
+    plot.plot(*at, "--" if _in_line(at) else ".", color="0.6", lw=0.8, label="undeformed", zorder=1)
+    unit = split_unit(rows[0]["result"])
+    labels = [f"${axis[1]}$" + (f"  ({unit[1]})" if unit else "") for axis in both]
+    plot.set(xlabel=labels[0], ylabel=labels[1])
+    plot.set_aspect("equal", adjustable="datalim")
+    plot.legend(frameon=False, fontsize=8)
+
+
+def _which(row: Row) -> tuple[str, str]:
+    return str(row["settings"]), str(row["at"])
+
+
+def _in_line(at: Sequence[Sequence[float]]) -> bool:
+    return any(np.ptp(v) == 0 for v in at) and all((np.diff(v) >= 0).all() for v in at)
+
+
+def _field(plot: Any, field: Row, number: int) -> None:
+    """A component of the field over the arc length with its band; on a surface its colours, rings for deviations."""
+    over, places = field["over"], np.array(field["places"])
+    value, deviation, low, high, mean = (
+        over["value"] * np.array(field[name])[:, number] for name in ("value", "deviation", "low", "high", "mean")
+    )
+    symbol = rf"$B^\mathrm{{r}}_{{{AXES[field['components'][number]]}}}$"
+    label = f"{symbol}  ({over['unit']})" if over["unit"] else rf"{symbol} over $|B^\mathrm{{r}}|$"
+    if places.shape[1] == 2 or not places[:, 1:].any():
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+        half = 1.96 * over["value"] * field["prior"]["deviation"]
+        plot.fill_between(along, mean - half, mean + half, color="0.9", lw=0, label="prior, 95 %")
+        plot.fill_between(along, low, high, color="C0", alpha=0.3, lw=0, label="95 %")
+        plot.plot(along, value, "o-", color="C0", ms=3, lw=1.2, label="fitted")
+        room = 0.3 * float(np.ptp([low, high]))
+        plot.set(xlabel="arc length over $R$", ylabel=label, ylim=(low.min() - room, high.max() + room))
+        plot.legend(frameon=False, fontsize=8)
+        return
+    first, second = sorted(int(i) for i in np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])
+    shown = plot.scatter(places[:, first], places[:, second], c=value, s=10 + 240 * deviation / deviation.max())
+    plot.figure.colorbar(shown, ax=plot, label=label)
+    title = f"standard deviation: area, to {deviation.max():.3g} {over['unit']}".rstrip()
+    plot.set(xlabel=f"${'xyz'[first]}/R$", ylabel=f"${'xyz'[second]}/R$", aspect="equal", title=title)
 
 
 def _data(plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row) -> None:

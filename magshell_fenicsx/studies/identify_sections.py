@@ -25,6 +25,24 @@ class ParameterSection(Section):
         return self
 
 
+class RemanenceSection(Section):
+    """The remanence as a field of numbers: components of vectors at points, of which each place has a mean.
+
+    Points and components are those of a design: along a meridian, or along a strip in the plane of x and z, elsewhere
+    spread over the surface, all of which is modelled. The prior has the case's own remanence as its mean and is smooth;
+    what is not given of it is chosen by the data, so that these are most likely.
+    """
+
+    points: Annotated[int, Field(ge=2, le=1000)] | None = None
+    """How many; without it those of `magnetic.remanent`, kind: points"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Nothing varies over less than this; by default the distance of the points [R]"""
+    deviation: float | None = Field(default=None, gt=0, le=100)
+    """Standard deviation of a component before anything is measured [|B^r|]"""
+    length: float | None = Field(default=None, gt=0, le=100)
+    """Distance over which the field is smooth: at 1.4 times of it the correlation is 0.3 [R]"""
+
+
 class CandidateSection(Section):
     """A further result: it is predicted with its 95 % band, and as a measurement compared with the others."""
 
@@ -42,11 +60,14 @@ class IdentifySection(Section):
     Each column of the data is a result of the case with its unit: `middle_uz [mm]` or `middle_uz_mm`. One column is
     what the last step prescribes, its load or displacement (`applied [mT]`, `w [mm]`); without it all is read where the
     path ends. Columns with the name of a key (`magnetic.applied.flux_density [mT]`) change the case from row to row.
+    A shape has the columns `x`, `y`, `z`, places on the undeformed shell, and `ux`, `uy`, `uz`, their displacements.
     """
 
-    parameters: Annotated[dict[str, ParameterSection], Field(min_length=1)]
+    parameters: dict[str, ParameterSection] = Field(default_factory=dict)
     """Key of the case with a number (`shell.youngs_modulus`, `magnetic.remanent.flux_density`) -> what is known of it:
     `{}`, or `{prior: 4.2 MPa, deviation: 0.2 MPa}`. It starts where the case has it"""
+    remanence: RemanenceSection | None = None
+    """The remanence as a field that is looked for, beside the parameters or alone"""
     noise: dict[str, Amount] = Field(default_factory=dict)
     """Column of the data -> standard deviation of its noise; by default estimated from the residuals"""
     changes: list[str] = Field(default_factory=list)
@@ -57,6 +78,12 @@ class IdentifySection(Section):
     """The parameter that the next measurement should narrow; by default the one with the largest relative deviation"""
     steps: int = Field(default=20, ge=1, le=1000)
     """At most so many steps of Gauss-Newton"""
+
+    @model_validator(mode="after")
+    def _something_is_looked_for(self) -> Self:
+        if not (self.parameters or self.remanence):
+            raise ValueError("give parameters, remanence, or both: nothing is looked for")
+        return self
 
     @model_validator(mode="after")
     def _narrowed_one_is_looked_for(self) -> Self:

@@ -6,21 +6,25 @@ import numpy as np
 import scipy
 
 from magshell_fenicsx.studies.identify_data import Table
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured
+from magshell_fenicsx.studies.identify_field import words
+from magshell_fenicsx.studies.laplace import NORMAL, Fit
 
 ALIKE = 0.95  # correlation from which two parameters are hardly told apart
 PRIOR = 0.9  # part of the prior's deviation above which data say little
 UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 
 
-def sentences(content: dict[str, Any], fit: Fit, known: Measured, table: Table) -> list[str]:
+def sentences(content: dict[str, Any], fit: Fit, table: Table) -> list[str]:
     """What is found, in words."""
+    known = fit.known
     said, keys = list[str](), list(content["parameters"])
     for key, each in content["parameters"].items():
         unit = f" {each['unit']}" if each["unit"] else ""
         said.append(f"{key} = {each['value']:.6g}{unit}, 95 % between {each['low']:.6g} and {each['high']:.6g}{unit}")
         if each["prior"] and each["deviation"] > PRIOR * each["prior"]["deviation"]:
             said.append(f"{key}: the data add little to its prior")
+    if content["remanence"]:
+        said += words(content["remanence"])
     for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
         if abs(c := float(fit.correlation[i, j])) > ALIKE:
             said.append(f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation {c:+.4f}")

@@ -12,11 +12,13 @@ column and one of priors, has the degrees of freedom V^2/sum (V_c^2/f_c) (F. E. 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+
+from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
 Model = Callable[[Array], tuple[Array, Array] | None]  # x (p,) -> y (n,) and J (n, p); None where there is none
@@ -29,6 +31,9 @@ RIGHT = 0.95  # of the bands
 LEAST = 1.0  # degree of freedom
 SAID = 0.5  # of a degree: with less, data do not say their noise
 EXACT = 1e-12  # no estimated noise is less than this part of the data
+ASIDE = 0.05  # differences of logarithms of strengths
+SAMPLES, WIDER, SUREST = 64, 1.3, 0.5  # of their posterior, wider than a normal one, whose logarithms are sure to 1.4
+MOST_AXES = 8  # of the posterior, the longest ones, along which it is looked at
 NORMAL = 0.25  # difference of the misfit from its parabola up to which the posterior counts as normal
 
 
@@ -62,6 +67,8 @@ class Measured:
         Of each column the standard deviation; nan where it is to be estimated.
     mean, deviation
         (p,) of the priors; a deviation is infinite where there is none.
+    field
+        The prior of a field among the parameters, whose deviations are infinite here.
     """
 
     data: Array
@@ -69,17 +76,21 @@ class Measured:
     noise: Array
     mean: Array
     deviation: Array
+    field: Smooth | None = None
 
     @property
-    def weight(self) -> Array:
-        """(p,) one over the deviations of the priors; zero without one."""
-        return np.asarray(1 / self.deviation)
+    def prior(self) -> Array:
+        """(p, p) W, whose product with mean - x is normal with deviations of one; zero rows without a prior."""
+        W = np.diag(1 / self.deviation)
+        if self.field:
+            W[self.field.block, self.field.block] = self.field.rows
+        return np.asarray(W)
 
     def rows(self, y: Array, J: Array, x: Array, noise: Array) -> tuple[Array, Array]:
         """Residuals and slopes over their deviations, data first."""
-        s, w = noise[self.group], self.weight
-        rest = np.concatenate([(self.data - y) / s, np.where(w > 0, (self.mean - x) * w, 0.0)])
-        return rest, np.vstack([J / s[:, None], np.diag(w)])
+        s, W = noise[self.group], self.prior
+        rest = np.concatenate([(self.data - y) / s, W @ (self.mean - x)])
+        return rest, np.vstack([J / s[:, None], W])
 
 
 @dataclass(frozen=True)
@@ -100,6 +111,8 @@ class Fit:
         Of Gauss-Newton.
     ended
         Why it ended.
+    known
+        With the prior of a field as strong as the data have chosen it.
     """
 
     x: Array
@@ -112,11 +125,19 @@ class Fit:
     misfit: float
     steps: int
     ended: str
+    known: Measured
 
     @property
     def deviation(self) -> Array:
         """(p,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def local(self) -> Array:
+        """(p, p) covariance for noise and strengths of a field as they are at the fit."""
+        if not self.known.field:
+            return self.covariance
+        return _covariance(self.known.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation)
 
     @property
     def correlation(self) -> Array:
@@ -183,8 +204,8 @@ def fitted(
     """
     first = model(start)
     assert first, "there is a prediction at the start"
-    x, (y, J) = np.array(start), first
-    noise, freedom = _estimated(known, y, J, _guessed(known, y), size)
+    x, (y, J), given = np.array(start), first, known
+    known, noise, freedom = _weighed(given, known, x, y, J, _guessed(known, y), size)
     ended = f"{most} steps"
     for step in range(most + 1):
         rest, A = known.rows(y, J, x, noise)
@@ -210,11 +231,13 @@ def fitted(
             ended = "no step lowers the misfit"
             break
         x, (y, J) = tried, there
-        noise, freedom = _estimated(known, y, J, noise, size)
+        known, noise, freedom = _weighed(given, known, x, y, J, noise, size)
     if (silent := np.flatnonzero(freedom < SAID)).size:
         raise NoNoise(int(silent[0]))
     covariance = _covariance(known.rows(y, J, x, noise)[1], size)
-    return Fit(x, y, J, known.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended)
+    if known.field:
+        covariance = _Strength(given, known, x, y, J, noise, size).covariance()
+    return Fit(x, y, J, known.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended, known)
 
 
 def _covariance(A: Array, size: Array) -> Array:
@@ -241,13 +264,119 @@ def _guessed(known: Measured, y: Array) -> Array:
     return noise
 
 
+def _weighed(
+    given: Measured, known: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
+) -> tuple[Measured, Array, Array]:
+    """What is known, with the prior of the field as the data choose it; the noise, and its degrees of freedom."""
+    if known.field:
+        known, noise = _Strength(given, known, x, y, J, noise, size).best()
+        return known, noise, _estimated(known, y, J, noise, size)[1]
+    return known, *_estimated(known, y, J, noise, size)
+
+
+@dataclass(frozen=True)
+class _Strength:
+    """Deviation and length of a field's prior and the noise of columns, where they are not given; z: their logarithms.
+
+    `given` is what is known at first, `known` and `noise` where the search begins; see the module `smooth`.
+    """
+
+    given: Measured
+    known: Measured
+    x: Array
+    y: Array
+    J: Array
+    noise: Array
+    size: Array
+
+    @property
+    def own(self) -> tuple[Smooth, Smooth]:
+        assert self.given.field
+        assert self.known.field
+        return self.given.field, self.known.field
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Which of deviation and length are not given."""
+        return np.flatnonzero(np.isnan([self.own[0].deviation, self.own[0].length]))
+
+    @property
+    def unknown(self) -> NDArray[np.int64]:
+        """Columns whose noise is not given."""
+        return np.flatnonzero(np.isnan(self.given.noise))
+
+    def z(self, deviation: float, length: float) -> Array:
+        """Of a prior and of the noise that the search begins with."""
+        return np.log([*np.array([deviation, length])[self.free], *self.noise[self.unknown]])
+
+    def weighed(self, z: Array) -> tuple[Measured, Array]:
+        """What is known then, and the noise."""
+        first, _ = self.own
+        values, noise = np.array([first.deviation, first.length]), np.array(self.noise)
+        values[self.free], noise[self.unknown] = np.exp(z[: len(self.free)]), np.exp(z[len(self.free) :])
+        return replace(self.known, field=first.with_(float(values[0]), float(values[1]))), noise
+
+    def surprise(self, z: Array) -> float:
+        """-2 ln p(d)."""
+        (known, noise), (rest, A) = self.weighed(z), self._rows(z)
+        assert known.field
+        Q, R = np.linalg.qr(A * self.size)
+        least = rest @ rest - np.sum((Q.T @ rest) ** 2)
+        of_noise = 2 * np.log(noise[known.group]).sum()
+        return float(of_noise - known.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least)
+
+    def _rows(self, z: Array) -> tuple[Array, Array]:
+        known, noise = self.weighed(z)
+        return known.rows(self.y, self.J, self.x, noise)
+
+    def best(self) -> tuple[Measured, Array]:
+        """The most likely ones."""
+        first, last = self.own
+        z = min((self.z(*both) for both in last.starts(first)), key=self.surprise)
+        if len(z):
+            bounds = [first.bounds[i] for i in self.free]
+            least = EXACT * float(np.abs(self.known.data).max())
+            bounds += [(least, 1e3 * float(self.noise[i])) for i in self.unknown]
+            limits = np.log(bounds)
+            steps = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
+            options = {"initial_simplex": steps, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 400 * len(z)}
+            z = scipy.optimize.minimize(self.surprise, z, method="Nelder-Mead", bounds=limits, options=options).x
+        return self.weighed(z)
+
+    def covariance(self) -> Array:
+        """(p, p) of the posterior, over all strengths and noises as likely as they are (H. Rue, S. Martino and
+        N. Chopin, J. R. Stat. Soc. B 71, 319, 2009, section 3): by weighted samples about the best."""
+        _, last = self.own
+        z, count = self.z(last.deviation, last.length), len(self.free) + len(self.unknown)
+        if not count:
+            return _covariance(self._rows(z)[1], self.size)
+
+        def mixed(a: Array, b: Array) -> float:
+            around = [sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)]
+            return sum(around) / (8 * ASIDE**2)
+
+        step = ASIDE * np.eye(count)
+        sure, axes = np.linalg.eigh([[mixed(a, b) for b in step] for a in step])
+        wide = axes * WIDER / np.sqrt(np.maximum(sure, SUREST))
+        drawn = scipy.stats.norm.ppf(scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:])
+        samples = z + drawn @ wide.T
+        logarithms = np.array([-self.surprise(each) / 2 for each in samples]) + (drawn**2).sum(axis=1) / 2
+        weights = np.exp(logarithms - logarithms.max())
+        total = np.zeros((len(self.x), len(self.x)))
+        for weight, each in zip(weights / weights.sum(), samples, strict=True):
+            rest, A = self._rows(each)
+            away = self.size * np.linalg.lstsq(A * self.size, rest, rcond=None)[0]
+            total += weight * (_covariance(A, self.size) + np.outer(away, away))
+        return total
+
+
 def _estimated(known: Measured, y: Array, J: Array, noise: Array, size: Array) -> tuple[Array, Array]:
     """The noise of the columns, and the degrees of freedom of those that are estimated.
 
     A number takes as many degrees as its share in the parameters, the diagonal of J C J^T/s^2.
     """
     found, freedom, s = np.array(known.noise), np.full(len(noise), np.inf), noise[known.group]
-    C = _covariance(np.vstack([J / s[:, None], np.diag(known.weight)]), size)
+    C = _covariance(np.vstack([J / s[:, None], known.prior]), size)
     share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
     for column in np.flatnonzero(np.isnan(known.noise)):
         own = known.group == column
@@ -259,16 +388,19 @@ def _estimated(known: Measured, y: Array, J: Array, noise: Array, size: Array) -
     return found, freedom
 
 
-def nonlinearity(model: Model, known: Measured, fit: Fit) -> tuple[float, int]:
-    """The largest relative difference of the misfit from its parabola, at the ends of bands along principal axes.
+def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:
+    """The largest relative difference of the misfit from its parabola, at the ends of bands along the longest axes.
 
     Returns
     -------
     It, and at how many of these places nothing is predicted.
     """
+    fit = replace(fit, covariance=fit.local)
     size = fit.deviation
     spread, axes = np.linalg.eigh(fit.correlation)
     worst, lost = 0.0, 0
+    longest = np.argsort(-spread)[:MOST_AXES]
+    spread, axes = spread[longest], axes[:, longest]
     for s, axis, far in zip(spread, axes.T, fit.quantiles(axes.T / size), strict=True):
         for way in (-far, far):
             x = fit.x + way * size * np.sqrt(max(s, 0.0)) * axis
@@ -276,6 +408,6 @@ def nonlinearity(model: Model, known: Measured, fit: Fit) -> tuple[float, int]:
             if there is None:
                 lost += 1
                 continue
-            rest = known.rows(*there, x, fit.noise)[0]
+            rest = fit.known.rows(*there, x, fit.noise)[0]
             worst = max(worst, abs(float(rest @ rest - fit.misfit) / far**2 - 1))
     return worst, lost

@@ -251,3 +251,20 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
     said = [text.get_text() for text in both.axes[1].get_legend().get_texts()]
     assert said == ["by the pressure", "by the field", "nowhere"]
     assert len(one.axes) == 1
+
+
+@pytest.mark.slow
+def test_waves_of_a_meridian_in_their_sector(tmp_path: Path) -> None:
+    """Three waves of a clamped cap over Poisson's ratio: at both ends of the range as the meridian has them, 1e-3."""
+    case, key = tmp_path / "cap.yaml", "shell.poisson_ratio"
+    case.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 22, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\nmesh: {refinement: 1}\nloading: {kind: pressure, until: limit}\n"
+    )
+    found = ms.boundary(case, f"{key}=0.3:0.35:1", out=tmp_path / "b")
+    assert (found.content["kind"], found.content["mode"]) == ("bifurcation", "m = 3")
+    assert {row["mode"] for row in found.rows} == {"m = 3"}
+    for row in (found.rows[0], found.rows[-1]):
+        records = ms.follow(ms.Scene(ms.Case.load(case, [f"{key}={row['key']}"])))
+        waves = next(r for r in records if r.mode == "m = 3")
+        assert row["load"] == pytest.approx(waves.point.state.mu["pressure"], rel=1e-3)

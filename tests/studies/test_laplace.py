@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
 T = np.linspace(0.2, 3.0, 12)
@@ -77,10 +79,10 @@ def test_against_metropolis(deviation: float) -> None:
 def test_a_posterior_that_is_not_normal() -> None:
     """Two deviations of a spring known to 1 % lie on a parabola, those of one known to 20 % do not."""
     sure = measured(3)
-    assert nonlinearity(relaxing, sure, fit(sure))[0] < NORMAL
+    assert nonlinearity(relaxing, fit(sure))[0] < NORMAL
     y = sure.data + 14 * (sure.data - relaxing(TRUTH)[0])  # type: ignore[index]
     vague = Measured(y, sure.group, 15 * sure.noise, sure.mean, sure.deviation)
-    assert nonlinearity(relaxing, vague, fit(vague))[0] > NORMAL
+    assert nonlinearity(relaxing, fit(vague))[0] > NORMAL
 
 
 def test_one_more_measurement() -> None:
@@ -158,4 +160,64 @@ def test_bands_that_are_wide_as_data_are_few() -> None:
     known = Measured(data, np.zeros(2, dtype=np.int64), np.array([np.nan]), np.ones(1), np.array([np.inf]))
     own = fitted(spring, known, np.ones(1), np.ones(1), 20, lambda *_: None)
     assert own.band[0] < 0.5
-    assert nonlinearity(spring, known, own)[0] > NORMAL
+    assert nonlinearity(spring, own)[0] > NORMAL
+
+
+class Blurred:
+    """Forty means of a field of 25 numbers on a line, with noise: all is normal, its posterior has a closed form."""
+
+    S, LENGTH = 0.7, 0.25
+    X = np.linspace(0, 1, 25)
+    J = np.exp(-((np.linspace(0, 1, 40)[:, None] - X) ** 2) / 0.02) / 5
+
+    @property
+    def K(self) -> Array:
+        r = np.sqrt(3) * np.abs(self.X[:, None] - self.X) / self.LENGTH
+        return self.S**2 * ((1 + r) * np.exp(-r) + 1e-8 * np.eye(25))
+
+    def fit(self, truth: Array, seed: int, deviation: float, length: float, noise: float) -> Fit:
+        data = self.J @ truth + NOISE * np.random.default_rng(seed).normal(size=40)
+        smooth = Smooth(0, np.abs(self.X[:, None] - self.X), 1, deviation, length)
+        group = np.zeros(40, dtype=np.int64)
+        known = Measured(data, group, np.array([noise]), np.zeros(25), np.full(25, np.inf), smooth)
+        return fitted(lambda x: (self.J @ x, self.J), known, np.zeros(25), np.ones(25), 20, lambda *_: None)
+
+
+def test_a_smooth_field_of_given_strength() -> None:
+    """Mean and covariance of a normal field given its data (Rasmussen and Williams 2006, eq. 2.25 and 2.26)."""
+    own, rng = Blurred(), np.random.default_rng(2)
+    truth = np.linalg.cholesky(own.K) @ rng.normal(size=25)
+    fit = own.fit(truth, 3, own.S, own.LENGTH, NOISE)
+    gain = own.K @ own.J.T @ np.linalg.inv(own.J @ own.K @ own.J.T + NOISE**2 * np.eye(40))
+    assert fit.x == pytest.approx(gain @ fit.known.data, abs=1e-5)
+    assert fit.covariance == pytest.approx(own.K - gain @ own.J @ own.K, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_the_strength_that_makes_data_most_likely() -> None:
+    """No strength or noise nearby has a higher density of the data, which is normal (SciPy); of 40 fields bands cover
+    what they say, and misfit and noise are those that were put in."""
+    own, rng = Blurred(), np.random.default_rng(5)
+    inside, misfits, noises = list[float](), list[float](), list[float]()
+    for seed in range(40):
+        truth = np.linalg.cholesky(own.K) @ rng.normal(size=25)
+        fit = own.fit(truth, seed, np.nan, np.nan, np.nan)
+        prior = fit.known.field
+        assert prior
+
+        def density(s: float, length: float, noise: float, data: Array = fit.known.data) -> float:
+            other = Blurred()
+            other.S, other.LENGTH = s, length  # type: ignore[misc]
+            covariance = own.J @ other.K @ own.J.T + noise**2 * np.eye(40)
+            return float(scipy.stats.multivariate_normal.logpdf(data, np.zeros(40), covariance))
+
+        best = np.array([prior.deviation, prior.length, fit.noise[0]])
+        if seed < 5 and not prior.at_bounds():
+            around = [best * (1 + 0.05 * sign * axis) for axis in np.eye(3) for sign in (-1, 1)]
+            assert density(*best) > max(density(*each) for each in around)
+        inside.append(float(np.mean((fit.band[0] < truth) & (truth < fit.band[1]))))
+        misfits.append(float(np.mean((fit.known.data - fit.y) ** 2) / NOISE**2))
+        noises.append(float(fit.noise[0]))
+    assert 0.9 < np.mean(inside) < 0.98
+    assert np.mean(noises) == pytest.approx(NOISE, rel=0.05)
+    assert 0.6 < np.mean(misfits) < 1  # of 40 data, less what the field takes of them

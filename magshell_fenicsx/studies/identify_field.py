@@ -1,0 +1,149 @@
+"""The remanence as a field that is looked for: its numbers among the parameters, and what is found of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.tables import VECTORS, write_vectors
+from magshell_fenicsx.models.shell.controls import Controls
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.design_blocks import Vectors, by_components
+from magshell_fenicsx.studies.design_variables import controls_of
+from magshell_fenicsx.studies.identify_sections import RemanenceSection
+from magshell_fenicsx.studies.laplace import Fit
+from magshell_fenicsx.studies.runner import Case
+from magshell_fenicsx.studies.smooth import Smooth
+
+Array = NDArray[np.float64]
+NAME = "remanence"
+WHERE = f"identify.{NAME}"
+MOST = 2_000  # numbers
+
+
+@dataclass(frozen=True)
+class RemanenceField:
+    """Components of the remanence at points, over |B^r|.
+
+    Attributes
+    ----------
+    start
+        (n, 3), or (n, 2) on a meridian: vectors of the case itself, the mean of their prior.
+    free
+        The components that are looked for; on a strip those in the plane of x and z.
+    """
+
+    controls: Controls
+    start: Array
+    free: tuple[int, ...]
+    smooth: Smooth
+
+    @property
+    def first(self) -> Array:
+        """The numbers of the case itself."""
+        return np.asarray(self.start[:, self.free]).ravel()
+
+    @property
+    def names(self) -> list[str]:
+        """The components that are looked for, as in a file of vectors."""
+        return [VECTORS[self.start.shape[1]][i] for i in self.free]
+
+    def by(self, scene: Scene, gradient: FieldGradient) -> Array:
+        """The derivatives by the numbers; collective."""
+        return np.asarray(by_components(scene, gradient)[:, self.free]).ravel()
+
+    def vectors(self, x: Array) -> Array:
+        """All components at the points."""
+        found = np.array(self.start)
+        found[:, self.free] = x.reshape(len(found), -1)
+        return found
+
+    def write(self, x: Array, file: Path) -> None:
+        """Write the vectors, as a remanence of kind: points takes them."""
+        write_vectors(file, self.controls.places, self.vectors(x))
+
+    def put(self, data: dict[str, Any], file: Path) -> None:
+        """Let a case have the vectors of a file."""
+        Vectors(self.controls, self.start, None).put(data, self.start)
+        data["magnetic"]["remanent"]["file"] = str(file.absolute())
+
+    def found(self, fit: Fit, over: tuple[float, str]) -> dict[str, Any]:
+        """What is known of the field, as plain data; `over` is |B^r| and its unit."""
+        block, prior = self.smooth.block, fit.known.field
+        assert prior
+        shape = (len(self.start), len(self.free))
+        low, high = (v[block].reshape(shape) for v in fit.band)
+        kept = np.trace(fit.local[block, block] @ prior.rows.T @ prior.rows)
+        return {
+            "places": self.controls.places.tolist(),
+            "components": self.names,
+            "value": fit.x[block].reshape(shape).tolist(),
+            "deviation": fit.deviation[block].reshape(shape).tolist(),
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "mean": self.first.reshape(shape).tolist(),
+            "prior": {"deviation": prior.deviation, "length": prior.length, "at_bounds": prior.at_bounds()},
+            "determined": prior.size - float(kept),
+            "over": {"value": over[0], "unit": over[1]},
+        }
+
+
+def field_of(
+    source: Source, case: Case, section: RemanenceSection | None, first: int
+) -> tuple[RemanenceField | None, Source]:
+    """The remanence that is looked for, as parameters from `first` on, and the case whose model has room for it.
+
+    Raises
+    ------
+    CaseError
+        If the case has no remanence in a field.
+    """
+    if section is None:
+        return None, source
+    controls, start = controls_of(case, section.points, section.filter, WHERE)
+    in_plane = controls.around or case.shell.geometry == "strip"
+    free = (0, 1) if controls.around else (0, 2) if in_plane else (0, 1, 2)
+    if len(start) * len(free) > MOST:
+        raise CaseError(f"{WHERE}: {len(start)} points with {len(free)} components each; allowed are {MOST} numbers")
+    if len(start) < 2:
+        raise CaseError(f"{WHERE}: a single point is no field: look for numbers of magnetic.remanent instead")
+    distances = scipy.spatial.distance.cdist(controls.places, controls.places)
+    apart = distances[np.triu_indices(len(distances), 1)].min()
+    if apart <= 1e-9:
+        raise CaseError(f"{WHERE}: two of its points are at the same place")
+    smooth = Smooth(first, distances, len(free), section.deviation or np.nan, section.length or np.nan)
+    if not in_plane:
+        source = Source(source.name, {**source.data, "symmetry": "none"}, source.places, source.folder, source.files)
+    return RemanenceField(controls, start, free, smooth), source
+
+
+def flux_density(case: Case) -> tuple[float, str]:
+    """|B^r| in mT; without units (1, "")."""
+    given = case.magnetic.remanent.flux_density if case.magnetic and case.magnetic.remanent else None
+    return (1e3 * abs(given), "mT") if given else (1.0, "")
+
+
+def words(field: Mapping[str, Any]) -> list[str]:
+    """What is found of the field."""
+    over, prior = field["over"], field["prior"]
+    unit = f" {over['unit']}" if over["unit"] else " |B^r|"
+    deviation = over["value"] * np.array(field["deviation"])
+    numbers = deviation.size
+    said = [
+        f"{NAME}: {numbers} numbers at {len(deviation)} points, of which the data determine {field['determined']:.1f}; "
+        f"standard deviations {deviation.min():.3g} to {deviation.max():.3g}{unit}",
+        f"{NAME}: its prior is smooth over {prior['length']:.3g} R, with the deviation "
+        f"{over['value'] * prior['deviation']:.3g}{unit}",
+    ]
+    if prior["at_bounds"]:
+        said.append(
+            f"warning: the data do not say the {' and the '.join(prior['at_bounds'])} of the prior of the {NAME}: give "
+            f"{' and '.join(f'{WHERE}.{each}' for each in prior['at_bounds'])}"
+        )
+    return said

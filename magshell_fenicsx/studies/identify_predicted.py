@@ -1,0 +1,130 @@
+"""What a case predicts for values of its parameters; each evaluation is kept in a folder."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from dataclasses import field as field_of
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.input.source import CaseError, Source, override
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.simulate.gradients.instabilities import Lost
+from magshell_fenicsx.simulate.readings import Outside, Reading, read
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.design_blocks import Number
+from magshell_fenicsx.studies.identify_data import Parameter
+from magshell_fenicsx.studies.identify_field import NAME, RemanenceField
+from magshell_fenicsx.studies.runner import Made, keep, kept
+
+Array = NDArray[np.float64]
+Settings = tuple[str, ...]
+
+
+@dataclass
+class Seen:
+    """What is predicted for a vector of parameters; with a note there is nothing.
+
+    Attributes
+    ----------
+    values, slopes
+        (n,) and (n, p), in the units of data and parameters.
+    curves
+        Result -> places and values along the path, of the case without settings of rows.
+    invalid
+        Whether there is nothing as data are outside the path, or the case is none.
+    """
+
+    values: list[float] = field_of(default_factory=list)
+    slopes: list[list[float]] = field_of(default_factory=list)
+    curves: dict[str, list[tuple[float, float]]] = field_of(default_factory=dict)
+    note: str = ""
+    invalid: bool = False
+
+
+@dataclass
+class Predictor:
+    """Predicts readings for vectors of parameters; collective.
+
+    Attributes
+    ----------
+    readings
+        Settings of the case -> what is read there.
+    field
+        The remanence that is looked for; its numbers follow the parameters.
+    """
+
+    source: Source
+    made: Made
+    parameters: Sequence[Parameter]
+    readings: dict[Settings, list[Reading]]
+    folder: Path
+    mark: str
+    comm: MPI.Comm
+    field: RemanenceField | None = None
+    count: int = 0
+
+    def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
+        """What is predicted, known or new."""
+        x = np.array(self.comm.bcast(x))
+        listed = json.dumps([[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()])
+        text = f"{self.mark} {listed} {slopes}".encode()
+        file = self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
+        known = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
+        if known is None:
+            vectors = file.with_suffix(".csv")
+            if self.field:
+                by_first(self.comm, lambda: self._write(x, vectors))
+            known = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
+            self.count += 1
+            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(known)}))
+        return known
+
+    def _write(self, x: Array, vectors: Path) -> None:
+        assert self.field
+        vectors.parent.mkdir(parents=True, exist_ok=True)
+        self.field.write(x[len(self.parameters) :], vectors)
+
+    def _new(self, x: Array, slopes: bool, vectors: Path) -> Seen:
+        seen, keys = Seen(), [each.key for each in self.parameters]
+        for settings, wanted in self.readings.items():
+            try:
+                scene = self._scene(x, settings, vectors)
+                field = self.field
+                fields = {NAME: (field.first.size, partial(field.by, scene))} if field else None
+                found = read(scene, wanted, keys, slopes=slopes, fields=fields)
+            except (Lost, CaseError, MeshError) as e:
+                note = f"{', '.join(settings)}: {e}" if settings else str(e)
+                return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
+            seen.values += [float(v) for v in found.values]
+            sizes = [float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters]  # type: ignore[arg-type]
+            sizes += [1.0] * (found.slopes.shape[1] - len(sizes))
+            seen.slopes += [list(map(float, row)) for row in found.slopes * sizes]
+            seen.curves = seen.curves or found.curves
+        return seen
+
+    def _scene(self, x: Array, settings: Settings, vectors: Path) -> Scene:
+        source = varied(self.source, [each.number for each in self.parameters], x[: len(self.parameters)])
+        if self.field:
+            self.field.put(source.data, vectors)
+        for setting in settings:
+            override(source, setting)
+        return Scene(self.made(source).problem(), self.comm)
+
+
+def varied(source: Source, numbers: Sequence[Number], x: Array) -> Source:
+    """The source of a case with other numbers."""
+    data = json.loads(json.dumps(source.data))
+    data.pop("identify", None)
+    for number, value in zip(numbers, x, strict=True):
+        number.put(data, np.array([value]))
+    return Source(source.name, data, folder=source.folder, files=source.files)

@@ -1,0 +1,107 @@
+"""A field among the parameters: a prior under which it is smooth, as strong as the data make most likely.
+
+The numbers B (n, c) of a field at n places are normal about their mean, c components alike and apart, with
+
+    cov(B(x), B(y)) = s^2 k(|x - y|/l),    k(r) = (1 + sqrt(3) r) exp(-sqrt(3) r)
+
+(C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eq. 4.17). The
+deviation s, the length l and the noise of columns are those under which the data d are most likely (there, eq. 5.8):
+with the model linear about x, rows r of residuals over their deviations and their slopes A, those of priors too,
+
+    -2 ln p(d) = sum ln noise^2 - ln det Q + ln det A^T A + min |r - A dx|^2 + constant,
+
+Q being the inverse covariance of the field. A parameter without prior is integrated over too (D. A. Harville, J.
+Am. Stat. Assoc. 72, 320, 1977). Knows no shell.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+JITTER = 1e-8  # of a variance: keeps the matrix of places that are close definite
+WEAKEST, STRONGEST = 1e-3, 1e2  # bounds of s, over the field's unit
+LONGEST = 3.0  # bound of l, over the largest distance
+LOOKED = 4  # values of s and of l that the search starts from
+EDGE = 1.01  # factor within which a bound is reached
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """The prior of the parameters from `first` on.
+
+    Attributes
+    ----------
+    distances
+        (n, n) of the places.
+    components
+        c.
+    deviation, length
+        s and l; nan where the data choose them.
+    """
+
+    first: int
+    distances: Array
+    components: int
+    deviation: float = np.nan
+    length: float = np.nan
+
+    @property
+    def size(self) -> int:
+        """How many numbers the field has."""
+        return len(self.distances) * self.components
+
+    @property
+    def block(self) -> slice:
+        """Of the field in the vector of parameters."""
+        return slice(self.first, self.first + self.size)
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Least and largest s and l that are looked at; l from the distance of neighbours on."""
+        apart = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
+        return (WEAKEST, STRONGEST), (float(np.median(apart.min(axis=1))), LONGEST * float(self.distances.max()))
+
+    @cached_property
+    def _factor(self) -> tuple[Array, float]:
+        """W with W^T W = Q, and ln det Q, of one component."""
+        r = np.sqrt(3) * self.distances / self.length
+        K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
+        L = self.deviation * np.linalg.cholesky(K)
+        return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True), -2 * float(np.log(np.diag(L)).sum())
+
+    @property
+    def rows(self) -> Array:
+        """W of the whole field, (size, size)."""
+        return np.asarray(np.kron(self._factor[0], np.eye(self.components)))
+
+    @property
+    def determinant(self) -> float:
+        """ln det Q."""
+        return self.components * self._factor[1]
+
+    def at_bounds(self) -> list[str]:
+        """Which of s and l have reached a bound."""
+        return [
+            name
+            for name, value, (low, high) in zip(
+                ("deviation", "length"), (self.deviation, self.length), self.bounds, strict=True
+            )
+            if not low * EDGE < value < high / EDGE
+        ]
+
+    def with_(self, deviation: float, length: float) -> "Smooth":
+        """The same prior of another strength."""
+        return replace(self, deviation=deviation, length=length)
+
+    def starts(self, given: "Smooth") -> list[tuple[float, float]]:
+        """Strengths that a search begins with; what is given is kept."""
+        if np.isfinite(self.deviation):
+            return [(self.deviation, self.length)]
+        (_, _), (near, far) = self.bounds
+        deviations = np.geomspace(0.03, 3.0, LOOKED) if np.isnan(given.deviation) else [given.deviation]
+        lengths = np.geomspace(2 * near, far / 2, LOOKED) if np.isnan(given.length) else [given.length]
+        return [(float(s), float(ell)) for s in deviations for ell in lengths]
