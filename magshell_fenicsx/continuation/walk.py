@@ -10,14 +10,15 @@ import numpy as np
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.control import projected
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
-from magshell_fenicsx.continuation.path import Path, Quantity
+from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
-from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted
+from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted, max_abs
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
 MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a point between its ends
 MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
+BESIDE = 0.5  # of the way between two points: what is farther from their cubic lies on another branch
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 MOST_STEPS = 1000
@@ -97,10 +98,18 @@ class _Search:
 
     def try_at(self, s: float, low: Point, high: Point) -> Point | str:
         solved = self.path.inside(s, low, high, self.base)
-        if not isinstance(solved, str):
-            self.iterations += solved.iterations
-            self.factorisations += solved.factorisations
-        return solved
+        if isinstance(solved, str):
+            return solved
+        self.iterations += solved.iterations
+        self.factorisations += solved.factorisations
+        return "the iteration has left the branch" if self.left(solved, low, high) else solved
+
+    def left(self, point: Point, low: Point, high: Point) -> bool:
+        """Whether a point is so far from the cubic between two points that it lies on another branch."""
+        system, guess = self.path.system, self.path.between(point.s, low, high)
+        off = max_abs(system.comm, point.state.u - guess.u)
+        chord = max_abs(system.comm, high.state.u - low.state.u)
+        return off > max(BESIDE * chord, SEEN * system.length)
 
     def middle(self, low: Point, high: Point) -> Point | None:
         """A point somewhere between two others, with its own inertia; rounding may hide some places."""
@@ -128,7 +137,8 @@ class _Search:
             solved = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
             if isinstance(solved, str):
                 continue
-            if min(low.s, high.s) <= solved.s <= max(low.s, high.s) and pivots[0] <= solved.negative_pivots < pivots[1]:
+            inside = min(low.s, high.s) <= solved.s <= max(low.s, high.s)
+            if inside and pivots[0] <= solved.negative_pivots < pivots[1] and not self.left(solved, low, high):
                 return self.spent(solved)
         return None
 

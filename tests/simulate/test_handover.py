@@ -99,6 +99,26 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
         assert full.newton.factor_at(found.state).negative_pivots + others in (counted, counted + 1)
 
 
+@pytest.mark.parametrize("symmetry", ["half", 3])
+def test_an_instability_is_located_on_the_path(symmetry: str | int) -> None:
+    """Of a cap on a bed: other branches pass near its first bifurcation, at smaller loads (0.760 and 0.783)."""
+    cap = CAP["shell"] | {"radius": "25 mm", "thickness": "0.25 mm", "youngs_modulus": "1 MPa", "polar": 22.0}
+    case = CAP | {
+        "shell": cap,
+        "foundation": {"stiffness": "40 kPa/m"},
+        "loading": {"kind": "pressure", "until": "limit"},
+    }
+    loads = [
+        next(
+            record.point.state.mu["pressure"]
+            for record in follow(Scene(problem_of(case | other)))
+            if record.label == "bifurcation"
+        )
+        for other in ({}, {"symmetry": symmetry})
+    ]
+    assert loads[1] == pytest.approx(loads[0], rel=1e-3)
+
+
 def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     """Load, energy and deflection of the meridian; the mode's stiffness is zero in both models."""
     records = list(follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None))
