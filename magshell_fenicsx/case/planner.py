@@ -27,7 +27,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_fr
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
-from magshell_fenicsx.parts.laminate import laminate_of
+from magshell_fenicsx.parts.laminate import Laminated, laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
@@ -292,8 +292,8 @@ def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Ch
 
 
 def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
-    """A plane in which the mid-surface with its thickness and imperfections is its own image, with the edges that are
-    lost; else None.
+    """A plane in which the mid-surface with its thickness, plies and imperfections is its own image, with the edges
+    that are lost; else None.
 
     Parameters
     ----------
@@ -305,6 +305,7 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     parts = [
         of_shape(case.shell, perfect),
         *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches)),
+        *(plies.leaves(case.context, perfect) if (plies := Laminated.of(case.context)) else ()),
     ]
     vectors = [unit(v) for part in parts for v in part.vectors]
     planes = [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)

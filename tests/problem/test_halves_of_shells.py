@@ -107,10 +107,12 @@ def test_modes_of_both_sides() -> None:
     assert values[0] == pytest.approx(values[1], rel=1e-7)
 
 
+PLIES = {"along": [0, 0, 1], "plies": [{"angle": 30, "E1": 2, "E2": 1, "nu12": 0.3, "G12": 0.4, "fraction": 1}]}
 NOT_HALVED: dict[str, dict[str, Any]] = {
     "planes of their own": {"shells": {"low": tube(0), "high": plate([3, 1, 0], boundary={"left": "clamped"})}},
     "one that is held by nothing": {"shells": {"low": tube(0), "high": plate([3, -0.25, 0])}},
     "one that may touch itself": {"shells": {"low": tube(0), "high": tube(1)}, "contact": [["low", "low"]]},
+    "plies across the plane": {"shells": {"low": tube(0), "high": tube(1, laminate=PLIES)}},
     "a joint in the plane": {
         "shells": {"left": plate([-1, 0, 0], boundary={"left": "clamped", "bottom": "clamped"}),
                    "right": plate([0, 0, 0], boundary={"right": "clamped", "bottom": "clamped"})},

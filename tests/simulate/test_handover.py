@@ -99,6 +99,7 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
         assert full.newton.factor_at(found.state).negative_pivots + others in (counted, counted + 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("symmetry", ["half", 3])
 def test_an_instability_is_located_on_the_path(symmetry: str | int) -> None:
     """Of a cap on a bed: other branches pass near its first bifurcation, at smaller loads (0.760 and 0.783)."""
