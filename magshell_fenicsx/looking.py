@@ -79,14 +79,15 @@ def view(folder: Run) -> None:
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
-    from magshell_fenicsx.case.check import describe
     from magshell_fenicsx.case.opened import read_together, with_same_files
-    from magshell_fenicsx.public import problem_of
-    from magshell_fenicsx.simulate.perfect import with_modes
 
     with exit_codes():
         source = read_together(case, world(), set_ or [])
         read = with_same_files(Case.from_source(source), world())
+        from magshell_fenicsx.case.check import describe  # only now: the solver takes long to import
+        from magshell_fenicsx.public import problem_of
+        from magshell_fenicsx.simulate.perfect import with_modes
+
         problem = with_modes(problem_of(read, world()), world())
         print_line(describe(read, problem))
         if read.gradients or read.design:

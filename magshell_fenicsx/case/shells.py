@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
-from magshell_fenicsx.case.members import Members
 from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section, or_number, texts
 from magshell_fenicsx.mesh.assembly import Assembly, Place
 from magshell_fenicsx.mesh.patch import GivenField
@@ -141,6 +140,8 @@ class Several:
     @cached_property
     def assembly(self) -> Assembly:
         """All of them as one mesh."""
+        from magshell_fenicsx.case.members import Members  # the solver takes long to import
+
         materials = self.materials or {}
         moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
         laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
