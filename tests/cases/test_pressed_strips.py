@@ -11,7 +11,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
-h, WIDTH, GAP, CLAMP, DOWN = 0.002, 0.02, 0.5, 1.6, 0.2
+h, WIDTH, GAP, CLAMP, DOWN = 0.01, 0.02, 0.5, 1.6, 0.2
 
 
 def elastica() -> dict[str, float]:
