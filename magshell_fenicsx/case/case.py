@@ -19,7 +19,8 @@ from pydantic import (
 )
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
-from magshell_fenicsx.case.shells import Several, Shells, expanded, written
+from magshell_fenicsx.case.merged import expanded, written
+from magshell_fenicsx.case.shells import Several, Shells
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, texts

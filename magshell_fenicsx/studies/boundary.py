@@ -39,7 +39,7 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
-from magshell_fenicsx.studies.boundary_start import Start, start_from
+from magshell_fenicsx.studies.boundary_start import WAVES, Start, larger, same, start_from
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
 
@@ -48,8 +48,6 @@ FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"),
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
 ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
-WAVES = "m = "
-SAME = 1e-2  # of the load: an instability of two models
 SPECIAL = ("cusp", "turn", "meeting")
 SAID = {
     "cusp": "a cusp, where two folds are born",
@@ -190,13 +188,13 @@ def boundary(
         value = _value(source, span, made, outside=not start)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
         if begin["mode"] == "antisymmetric" or begin["mode"].startswith(WAVES):
-            mode, setting, what = begin["mode"], *_larger(source, begin["mode"], made)
+            mode, setting, what = begin["mode"], *larger(source, begin["mode"], made)
             once(f"the instability is {mode}: {what} is modelled")
             override(source, setting)
             again, of_mode = begun_at.anywhere(), begin
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
             if begin["label"] and mode.startswith(WAVES) and setting != "symmetry=none":
-                begin = _same(of_mode, begin)
+                begin = same(of_mode, begin)
         if not begin["label"]:
             instability([])
         refuse_excluded(begin["mode"])
@@ -217,38 +215,6 @@ def boundary(
     for line in done.content["said"]:
         once(line)
     return done
-
-
-def _larger(source: Source, mode: str, made: Made) -> tuple[str, str]:
-    """The setting of the smallest model that has a mode, and what it is: of m waves a sector if the case has one."""
-    if mode.startswith(WAVES):
-        m = int(mode.removeprefix(WAVES))
-        sector, setting = copy.deepcopy(source), f"symmetry={m}"
-        override(sector, setting)
-        try:
-            made(sector).problem()
-        except CaseError:
-            pass
-        else:
-            return setting, f"the sector of {180 / m:.4g} degrees between two mirror planes"
-    return "symmetry=none", "the whole shell"
-
-
-def _same(of_meridian: dict[str, Any], of_sector: dict[str, Any]) -> dict[str, Any]:
-    """The instability of a sector, if it is the waves of the meridian.
-
-    Raises
-    ------
-    CaseError
-        If it is another one.
-    """
-    one, two = of_meridian["value"], of_sector["value"]
-    if of_sector["label"] != "bifurcation" or abs(two - one) > SAME * abs(one):
-        raise CaseError(
-            f"the sector first loses its stability at {two:.6g}, where the meridian has {of_meridian['mode']} at "
-            f"{one:.6g}: take a finer mesh, or symmetry: none"
-        )
-    return of_sector | {"mode": "", "waves": of_meridian["mode"]}
 
 
 def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
