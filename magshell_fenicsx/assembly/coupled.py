@@ -41,8 +41,8 @@ def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem
 
 def of_all(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> "OfAll | None":
     """What the terms among these add that are a `WholeTerm`; None if there are none."""
-    found = [t for t in terms if isinstance(t, WholeTerm)]
-    return OfAll(WholeMatrix(V, clamped), found) if found else None
+    whole_terms = [t for t in terms if isinstance(t, WholeTerm)]
+    return OfAll(WholeMatrix(V, clamped), whole_terms) if whole_terms else None
 
 
 @dataclass(frozen=True)

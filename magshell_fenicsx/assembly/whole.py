@@ -118,8 +118,8 @@ class WholeMatrix:
 
     def rows(self, term: WholeTerm, *, rough: bool = False) -> Array:
         """The rows (own unknowns, all) of a term, summed over the ranks, supports too. Collective."""
-        parts, (known, summed) = term.rows(rough=rough), self._summed.get(term.name, (None, np.empty(0)))
-        if known is not parts:
+        parts, (summed_before, summed) = term.rows(rough=rough), self._summed.get(term.name, (None, np.empty(0)))
+        if summed_before is not parts:
             summed = self._own(parts).reshape(3 * self._owned, -1)
             self._summed[term.name] = parts, summed
         return summed

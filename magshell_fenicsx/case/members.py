@@ -49,17 +49,17 @@ class Members:
         vectors, loosely
             See `Outline.mirrors`.
         """
-        found = list[Mirror]()
+        mirrors = list[Mirror]()
         if not self._held:
-            return found
+            return mirrors
         for plane in self._candidates(vectors, loosely):
             for side in (plane, plane.reversed):
                 kept = [self._kept(part, side, loosely) for part in self._several.parts]
-                if all(kept) and not any(_same(side, other) for other in found):
+                if all(kept) and not any(_same(side, other) for other in mirrors):
                     named = zip(self._several.parts, kept, strict=True)
                     lost = {f"{p.name}_{a}": f"{p.name}_{b}" for p, own in named if own for a, b in own.lost.items()}
-                    found.append(replace(side, lost=lost))
-        return found
+                    mirrors.append(replace(side, lost=lost))
+        return mirrors
 
     def _member(self, part: "Part", plane: Mirror | None) -> Member:
         """A shell, or its half at a plane in its own frame: that of its mesh is turned into the plane."""

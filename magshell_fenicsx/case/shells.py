@@ -182,12 +182,12 @@ class Several:
     @cached_property
     def laminates(self) -> "dict[str, Laminate]":
         """Name of a shell -> its plies, where it is."""
-        found: dict[str, Laminate] = {}
+        laminates: dict[str, Laminate] = {}
         for part in self.parts:
             if laminate := laminate_of(part.case.shell, 0.0):
                 place = self.place(part)
-                found[part.name] = replace(laminate, axes=place.Q, origin=place.position)
-        return found
+                laminates[part.name] = replace(laminate, axes=place.Q, origin=place.position)
+        return laminates
 
     @property
     def told(self) -> list[str]:

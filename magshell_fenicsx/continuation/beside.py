@@ -104,10 +104,10 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
             parts = [vectors[:, i].real, vectors[:, i].imag] if values[i].imag > 0 else [vectors[:, i].real]
             if values[i].imag < 0:
                 continue
-            found = [krylov.combined(part) for part in parts]
+            vectors_of_value = [krylov.combined(part) for part in parts]
             if values[i].imag == 0 and values[i].real < -1:
-                more += 1 if energy(found[0]) < 0 else -1
-            for x in found:
+                more += 1 if energy(vectors_of_value[0]) < 0 else -1
+            for x in vectors_of_value:
                 x = apart(x)
                 out.append(x / np.sqrt(dot(comm, x, x)))
     return None

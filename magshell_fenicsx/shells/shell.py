@@ -176,10 +176,10 @@ class ShellModel(Thin):
         planes: list[Mirror] = []
 
         def facets(condition: Condition) -> NDArray[np.int32]:
-            found = [
+            held_unknowns = [
                 midsurface.edges[name] for name, c in conditions.items() if c == condition and name in midsurface.edges
             ]
-            return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
+            return np.unique(np.concatenate(held_unknowns)).astype(np.int32) if held_unknowns else np.empty(0, np.int32)
 
         for name, side in sides.items():
             planes.append(side)
@@ -283,7 +283,7 @@ class ShellModel(Thin):
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
-        stiffnesses = dict(known.history for known, _ in self.contacts.values())
+        stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
         stiffnesses |= dict(each.history for each in self.touchings)
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses

@@ -123,20 +123,20 @@ class TermFactory:
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m; and what is soft."""
-        known = None
+        applied = None
         if of.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
-            known = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
-            self.fields.append(known)
+            applied = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
+            self.fields.append(applied)
         if of.soft is None:
-            return self.remanent(of, known)
-        return [*([] if of.soft.alone else self.remanent(of, known)), self.soft(of, of.soft, known)]
+            return self.remanent(of, applied)
+        return [*([] if of.soft.alone else self.remanent(of, applied)), self.soft(of, of.soft, applied)]
 
-    def soft(self, field: Magnetisation, soft: Soft, known: AppliedField | None) -> SolidTerm:
+    def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
-        chi, n0, *given = self._of_sheet(sheet, soft, known)
+        chi, n0, *given = self._of_sheet(sheet, soft, applied)
         density = Density(sheet.of_body, (chi, scale, n0, h, *given), VALUE + GRADIENT)
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
@@ -144,14 +144,14 @@ class TermFactory:
         """The integrals of the polarisation over the undeformed volume of what is modelled, and that volume."""
         if field.soft is None:
             return {}
-        sheet, known = Sheet(field), self.fields[-1] if field.in_space else None
-        chi, n0, *given = self._of_sheet(sheet, field.soft, known)
-        found = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
+        sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
+        chi, n0, *given = self._of_sheet(sheet, field.soft, applied)
+        densities = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            found[axis] = Density(sheet.induced_in_body, (chi, *self._constants(e), n0, *given))
-        return {f"induced {name}": self._over_body(density) for name, density in found.items()}
+            densities[axis] = Density(sheet.induced_in_body, (chi, *self._constants(e), n0, *given))
+        return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
-    def _of_sheet(self, sheet: Sheet, soft: Soft, known: AppliedField | None) -> "list[fem.Constant | fem.Function]":
+    def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> "list[fem.Constant | fem.Function]":
         """The susceptibility, the normals of layers, the amplitudes, and the parts of the field."""
         chi, V = soft.susceptibility, self.u.function_space
         of_place = (
@@ -161,15 +161,15 @@ class TermFactory:
         )
         n0 = field_in_body(radial, V, name="n0")
         amplitudes = [self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes]
-        polynomials = [known.polynomial] if known else []
+        polynomials = [applied.polynomial] if applied else []
         return [of_place, n0, *amplitudes, *self._constants(*sheet.vectors), *polynomials]
 
-    def remanent(self, of: Magnetisation, known: AppliedField | None) -> list[SolidTerm]:
+    def remanent(self, of: Magnetisation, field: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
         pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
         Br = field_in_body(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
-        if known:
-            density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
+        if field:
+            density = Density(law.magnetic_in_space, (Br, field.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
             return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", of.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
@@ -265,7 +265,7 @@ class TermFactory:
         parameters = self._constants(unit, *([origin] if origin is not None and origin.any() else []))
         of, on_end = (densities.swept, densities.swept_end) if moved else (densities.pressure, densities.sealing)
         work, end_work = (None, None) if potential else (densities.following, densities.following_end)
-        found = {"pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)}
+        of_faces = {"pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)}
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
             links = self.body.mesh.topology.connectivity(2, 3)
@@ -274,10 +274,10 @@ class TermFactory:
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
                     here, upper = facets[inside], name == "upper"
-                    found[f"pressure {name}"] = Density(
+                    of_faces[f"pressure {name}"] = Density(
                         on_end, parameters, VALUE + GRADIENT, WHOLE, "end", here, upper, end_work
                     )
-        return found
+        return of_faces
 
     def _bulk(
         self,
@@ -294,12 +294,12 @@ class TermFactory:
         term.group, term.column = group or name, column
         return term
 
-    def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:
+    def _on_faces(self, densities: Sequence[Density], v: Expr | None = None) -> ufl.Form:
         """The sum of energies, or of virtual works of v."""
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
-        ds, forms = face_measure(domain, [density.facets for density in found]), []
-        for tag, density in enumerate(found, 1):
+        ds, forms = face_measure(domain, [density.facets for density in densities]), []
+        for tag, density in enumerate(densities, 1):
             of = density.of if v is None else density.work
             assert of
             parameters = density.parameters if v is None else (v, *density.parameters)

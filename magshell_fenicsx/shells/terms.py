@@ -181,18 +181,18 @@ class EnergyFactory:
 
         A field in space is known at the displacement u.
         """
-        known = None
+        applied = None
         if field.in_space:
-            known = AppliedField(field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven)
-            self.fields.append(known)
+            applied = AppliedField(field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven)
+            self.fields.append(applied)
         if field.soft is None:
-            return self.remanent(field, known)
-        return [*([] if field.soft.alone else self.remanent(field, known)), self.soft(field, field.soft, known)]
+            return self.remanent(field, applied)
+        return [*([] if field.soft.alone else self.remanent(field, applied)), self.soft(field, field.soft, applied)]
 
-    def soft(self, field: Magnetisation, soft: Soft, known: AppliedField | None) -> Energy:
+    def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
         sheet, scale = Sheet(field), self._constant(soft.scale)
-        chi, *given = self._of_sheet(sheet, soft, known)
+        chi, *given = self._of_sheet(sheet, soft, applied)
         parts = FIRST if field.uniform else MOVED
         density = Density(per_area(sheet.of_surface), (chi, scale, *given), parts=parts)
         return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
@@ -201,14 +201,14 @@ class EnergyFactory:
         """The integrals of the polarisation over the undeformed volume of what is modelled, over h; and that volume."""
         if field.soft is None:
             return {}
-        sheet, known = Sheet(field), self.fields[-1] if field.in_space else None
-        chi, *given = self._of_sheet(sheet, field.soft, known)
-        found = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
+        sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
+        chi, *given = self._of_sheet(sheet, field.soft, applied)
+        by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            found[axis] = Density(per_area(sheet.induced), (chi, self._constant(e), *given))
-        return {f"induced {name}": self._over_area(self._thick(density)) for name, density in found.items()}
+            by_name[axis] = Density(per_area(sheet.induced), (chi, self._constant(e), *given))
+        return {f"induced {name}": self._over_area(self._thick(density)) for name, density in by_name.items()}
 
-    def _of_sheet(self, sheet: Sheet, soft: Soft, known: AppliedField | None) -> list[Parameter]:
+    def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> list[Parameter]:
         """The susceptibility, the amplitudes, and the parts of the field."""
         chi = soft.susceptibility
         of_place = (
@@ -217,15 +217,15 @@ class EnergyFactory:
             else self._constant(chi)
         )
         amplitudes = [self.free.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes]
-        return [of_place, *amplitudes, *map(self._constant, sheet.vectors), *([known.polynomial] if known else [])]
+        return [of_place, *amplitudes, *map(self._constant, sheet.vectors), *([applied.polynomial] if applied else [])]
 
-    def remanent(self, field: Magnetisation, known: AppliedField | None) -> list[Energy]:
+    def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern, carrier, thins = field.remanent, self.carrier, self.material.law.some_thin
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
-        if known:
-            density = self._magnetised(field, densities.in_space(full), Br, known.polynomial, parts=MOVED)
+        if applied:
+            density = self._magnetised(field, densities.in_space(full), Br, applied.polynomial, parts=MOVED)
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
@@ -305,15 +305,15 @@ class EnergyFactory:
         carrier, approach = self.carrier, self.free.setdefault(contact.amplitude, self._constant(0.0))
         rule, thins = carrier.contact_rule, self.material.law.some_thin
         thins_at = thinning(carrier, self.u, self.natural, self.law_of_cells.thins) if thins else None
-        known = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at)
+        pressing = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at)
         of, parts = (thinned_energy, MOVED) if thins else (contact_energy, ("r",))
-        density = Density(per_area(of), known.parameters, parts, quadrature=rule)
+        density = Density(per_area(of), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
-        by_name = {name: Density(per_area(of), known.parameters, quadrature=rule) for name, of in seen.items()}
+        by_name = {name: Density(per_area(of), pressing.parameters, quadrature=rule) for name, of in seen.items()}
         integrals = {name: self._over_area(density) for name, density in by_name.items()}
-        return carrier.energy(f"contact {contact.body}", density), known, integrals
+        return carrier.energy(f"contact {contact.body}", density), pressing, integrals
 
     def _over_area(self, density: Density) -> ufl.Form:
         return self.carrier.whole * self.carrier.integral(density, self.carrier.jet(self.u))

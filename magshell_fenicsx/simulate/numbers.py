@@ -189,9 +189,9 @@ def carried(old: Scene, new: Scene, state: State, own: Collection[str] = (), ste
 
 def goals(old: Scene, new: Scene, quantity: str, steps: int | None = None) -> dict[str, float]:
     """Amplitude -> target of the new scene over that of the old one, where they differ: those that have units."""
-    found = dict[str, float]()
+    targets = dict[str, float]()
     for before, after in zip(old.problem.programme[:steps], new.problem.programme[:steps], strict=True):
         one, two = before.load.target, after.load.target
         if one and two and one[0].quantity == quantity and one[1] and one[1] != two[1]:
-            found[before.name] = two[1] / one[1]
-    return found
+            targets[before.name] = two[1] / one[1]
+    return targets

@@ -234,16 +234,16 @@ class Read:
         """That of a column at a point of the last step."""
         return adjoint(self.scene, record, of, None, self._history.begins)
 
-    def slopes(self, found: Sequence[Adjoint], key: str, placed: Sequence[bool]) -> Array:
+    def slopes(self, adjoints: Sequence[Adjoint], key: str, placed: Sequence[bool]) -> Array:
         """Derivatives of results by a number of the case; a place stays where `placed` says that there is one."""
         others = dict[float, Scene]()  # the same for all results
-        slopes = np.array([float(derivative(each, key, others)) for each in found])  # type: ignore[arg-type]
+        slopes = np.array([float(derivative(each, key, others)) for each in adjoints])  # type: ignore[arg-type]
         if not any(placed) or not (rate := self.places.rate(key)):
             return slopes
         name = self.places.name
         moved = [
             float(derivative(each, name)) * each.state.mu[name] * rate if there else 0.0  # type: ignore[arg-type]
-            for each, there in zip(found, placed, strict=True)
+            for each, there in zip(adjoints, placed, strict=True)
         ]
         return np.asarray(slopes + np.array(moved))
 
@@ -323,15 +323,15 @@ def read(
     """
     path = Read(scene, wanted)
     changed = list(dict.fromkeys(each.of for each in wanted if each.change))
-    found = [path.adjoint(each) for each in wanted] + [path.adjoint_at(path.begin, of) for of in changed]
+    adjoints = [path.adjoint(each) for each in wanted] + [path.adjoint_at(path.begin, of) for of in changed]
     placed = [each.at is not None for each in wanted] + [True for _ in changed]
-    values = np.array([each.shown for each in found])
-    by = np.zeros((len(found), len(keys) + sum(count for count, _ in (fields or {}).values())))
+    values = np.array([each.shown for each in adjoints])
+    by = np.zeros((len(adjoints), len(keys) + sum(count for count, _ in (fields or {}).values())))
     for i, key in enumerate(keys if slopes else ()):
-        by[:, i] = path.slopes(found, key, placed)
+        by[:, i] = path.slopes(adjoints, key, placed)
     begun = len(keys)
     for field_name, (count, of_field) in (fields or {}).items() if slopes else ():
-        for row, each in zip(by, found, strict=True):
+        for row, each in zip(by, adjoints, strict=True):
             row[begun : begun + count] = of_field(derivative(each, field_name))  # type: ignore[arg-type]
         begun += count
     for i, reading in enumerate(wanted):

@@ -185,7 +185,7 @@ class Scene:
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
-        lost_here = [known.lost for known in self.model.fields if known.lost]
+        lost_here = [field.lost for field in self.model.fields if field.lost]
         said = [each for part in self.model.system.comm.allgather(lost_here) for each in part]
         return f"; on this way a step has found no field: {said[0]}" if said else ""
 

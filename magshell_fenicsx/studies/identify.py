@@ -73,8 +73,8 @@ class Identified:
     @property
     def remanence(self) -> dict[str, Any] | None:
         """Of the field that was looked for: places over R, values over |B^r|, deviations and bands, and its prior."""
-        found: dict[str, Any] | None = self.content["remanence"]
-        return found
+        field: dict[str, Any] | None = self.content["remanence"]
+        return field
 
 
 def identify(
@@ -179,7 +179,7 @@ def _identified(
     mean = np.array([*(each.mean for each in parameters), *numbers])
     deviation = np.array([*(each.deviation for each in parameters), *np.full(numbers.size, np.inf)])
     noise = np.array([column.noise for column in table.columns])
-    known = Measured(table.data, table.column, noise, mean, deviation, field.smooth if field else None)
+    measured = Measured(table.data, table.column, noise, mean, deviation, field.smooth if field else None)
     finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
     size = np.where(finite > 0, finite, 1.0)
     size[len(parameters) :] = 1.0
@@ -199,7 +199,7 @@ def _identified(
         say(f"{step:5d}  misfit {misfit:.4g} of the noise squared, {_said(parameters, x)}")
 
     try:
-        fit = fitted(model, known, start, size, section.steps, told)
+        fit = fitted(model, measured, start, size, section.steps, told)
     except NotSeen as e:
         alike = [parameters[number].key for number in e.numbers]
         raise CaseError(
@@ -243,10 +243,10 @@ def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence
 
 def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
     """What is found, as plain data."""
-    known = fit.known
+    measured = fit.known
     low, high = fit.band
     far = fit.quantiles(np.eye(len(fit.x)))
-    found = {
+    parameters = {
         p.key: {
             "value": float(fit.x[i]),
             "deviation": float(fit.deviation[i]),
@@ -283,19 +283,19 @@ def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
         column.header: {
             "deviation": float(fit.noise[i]),
             "unit": column.unit,
-            "estimated": bool(np.isnan(known.noise[i])),
+            "estimated": bool(np.isnan(measured.noise[i])),
             "degrees_of_freedom": None if np.isinf(fit.freedom[i]) else float(fit.freedom[i]),
         }
         for i, column in enumerate(table.columns)
     }
     return {
-        "parameters": found,
+        "parameters": parameters,
         "correlation": fit.correlation.tolist(),
         "covariance": fit.covariance.tolist(),
         "noise": noise,
         "places": table.places,
         "shape": dict(table.shape),
-        "misfit_over_noise": float(np.sqrt(np.mean(((known.data - fit.y) / s) ** 2))),
+        "misfit_over_noise": float(np.sqrt(np.mean(((measured.data - fit.y) / s) ** 2))),
         "steps": fit.steps,
         "ended": fit.ended,
         "rows": rows,
@@ -314,7 +314,7 @@ def _others(
     size = np.where(fit.x != 0, np.abs(fit.x), 1.0)
     relative = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
     chosen = section.narrow or (max(relative, key=relative.__getitem__) if keys else NAME)
-    found = list[dict[str, Any]]()
+    rows = list[dict[str, Any]]()
     for reading, unit, noise in others:
         alone = Predictor(
             predictor.source,
@@ -332,19 +332,19 @@ def _others(
         )
         predictor.count += alone.count
         if seen.note:
-            found.append({**row, "note": seen.note})
+            rows.append({**row, "note": seen.note})
             continue
         slope = np.array(seen.slopes[0])
         value, half = seen.values[0], float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0])
         narrowed = _named(keys, fit.narrowed(slope, noise))
         low, high = value - half, value + half
-        found.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
-    there = [each for each in found if "value" in each]
+        rows.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
+    there = [each for each in rows if "value" in each]
     if not there:
-        return found, None
+        return rows, None
     best = min(there, key=lambda each: each["deviations_then"][chosen])
     how = {"parameter": chosen, "from": deviations[chosen], "to": best["deviations_then"][chosen]}
-    return found, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
+    return rows, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
 
 
 def _named(keys: Sequence[str], deviations: Array) -> dict[str, float]:
@@ -356,14 +356,14 @@ def _named(keys: Sequence[str], deviations: Array) -> dict[str, float]:
 
 def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tuple[float, float]]]:
     """Result -> the path at the fit, as far as data go."""
-    seen, found = predictor(fit.x), dict[str, list[tuple[float, float]]]()
+    seen, curves = predictor(fit.x), dict[str, list[tuple[float, float]]]()
     for of, curve in seen.curves.items():
         if of.startswith(OF_POINTS):
             continue
         places = [r.at for each in table.readings.values() for r in each if r.of == of and r.at is not None]
         upto = next((i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))), len(curve) - 1)
-        found[of] = curve[: upto + 1]
-    return found
+        curves[of] = curve[: upto + 1]
+    return curves
 
 
 def _write(done: Identified, drawn: Callable[[Path], None], folder: Path, predictor: Predictor) -> None:

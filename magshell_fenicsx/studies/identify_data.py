@@ -125,7 +125,7 @@ class Names:
             if near and near != name:
                 raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
             own = shown.get(name, ("", ""))[1]
-            found = name
+            result = name
             factor = 1.0
         else:
             fitting = [of for of in shown if of == name or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", of)]
@@ -133,17 +133,17 @@ class Names:
                 raise CaseError(
                     f"{where}: {name}: has the unit {unit}, but no result of this name has one in this case"
                 )
-            found = min(fitting, key=len)
-            own = shown[found][1]
+            result = min(fitting, key=len)
+            own = shown[result][1]
             try:
                 factor = column_size(name, unit, own)
             except TableError as e:
                 raise CaseError(f"{where}: {e}") from None
-        if self.places is None or found != self.places.column:
-            refuse_no_result(scene, [found], where)
-            if found in SCALES:
-                refuse_unitless(scene, found)
-        return found, own, factor
+        if self.places is None or result != self.places.column:
+            refuse_no_result(scene, [result], where)
+            if result in SCALES:
+                refuse_unitless(scene, result)
+        return result, own, factor
 
     @property
     def _bare(self) -> list[str]:
@@ -179,11 +179,11 @@ class Names:
         return float(number) * factor
 
     def _of_unit(self, of: str, unit: str, where: str) -> tuple[str, str, float]:
-        found, own, _ = self.of(of, None, where)
+        result, own, _ = self.of(of, None, where)
         if not own:
             raise CaseError(f"{where}: {of} has no unit, so this number has none: {unit}")
         try:
-            return found, own, column_size(of, unit, own)
+            return result, own, column_size(of, unit, own)
         except TableError as e:
             raise CaseError(f"{where}: {e}") from None
 
@@ -200,20 +200,20 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
     CaseError
         If a key has no number, or its prior another unit.
     """
-    found = []
-    for key, known in section.parameters.items():
+    parameters = []
+    for key, given in section.parameters.items():
         where = f"identify.parameters.{key}"
         try:
             number_of(case.context, key)
             start, unit = _written(source, case, key)
-            mean, deviation = (_in_unit_of(unit, amount, key) for amount in (known.prior, known.deviation))
+            mean, deviation = (_in_unit_of(unit, amount, key) for amount in (given.prior, given.deviation))
         except CaseError as e:
             raise CaseError(f"{where}: {e}") from None
-        if known.deviation is not None and not deviation > 0:
-            raise CaseError(f"{where}.deviation: must be positive, here {_text(known.deviation)}")
-        prior = (mean, deviation) if known.prior is not None else (start, np.inf)
-        found.append(Parameter(Number(key, np.array([start]), (0.0, 1.0), unit), *prior))
-    return tuple(found)
+        if given.deviation is not None and not deviation > 0:
+            raise CaseError(f"{where}.deviation: must be positive, here {_text(given.deviation)}")
+        prior = (mean, deviation) if given.prior is not None else (start, np.inf)
+        parameters.append(Parameter(Number(key, np.array([start]), (0.0, 1.0), unit), *prior))
+    return tuple(parameters)
 
 
 def _written(source: Source, case: Case, key: str) -> tuple[float, str]:
@@ -307,12 +307,12 @@ def table_of(
             at, places = values * factor, of
             continue
         noise = section.noise.get(name, section.noise.get(of))
-        known = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
+        deviation = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
         of = of.removeprefix(rows[0]) if moved else of
         length = own if moved else length
-        if noise is not None and not known > 0:
+        if noise is not None and not deviation > 0:
             raise CaseError(f"identify.noise.{name}: must be positive, here {_text(noise)}")
-        results.append((Column(name, of, own, known), values * factor))
+        results.append((Column(name, of, own, deviation), values * factor))
     if not results:
         raise CaseError(f"{where}: has no column with a result of this case")
     _refuse_unknown(section, [each for each, _ in results], where)

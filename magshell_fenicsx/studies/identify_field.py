@@ -60,9 +60,9 @@ class RemanenceField:
 
     def vectors(self, x: Array) -> Array:
         """All components at the points."""
-        found = np.array(self.start)
-        found[:, self.free] = x.reshape(len(found), -1)
-        return found
+        components = np.array(self.start)
+        components[:, self.free] = x.reshape(len(components), -1)
+        return components
 
     def write(self, x: Array, file: Path) -> None:
         """Write the vectors, as a remanence of kind: points takes them."""

@@ -79,15 +79,15 @@ class Predictor:
         listed = json.dumps([[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()])
         text = f"{self.mark} {listed} {slopes}".encode()
         file = self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
-        known = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
-        if known is None:
+        seen = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
+        if seen is None:
             vectors = file.with_suffix(".csv")
             if self.field:
                 by_first(self.comm, lambda: self._write(x, vectors))
-            known = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
+            seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
             self.count += 1
-            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(known)}))
-        return known
+            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)}))
+        return seen
 
     def _write(self, x: Array, vectors: Path) -> None:
         assert self.field
@@ -101,15 +101,15 @@ class Predictor:
                 scene = self._scene(x, settings, vectors)
                 field = self.field
                 fields = {NAME: (field.first.size, partial(field.by, scene))} if field else None
-                found = read(scene, wanted, keys, slopes=slopes, fields=fields)
+                readings = read(scene, wanted, keys, slopes=slopes, fields=fields)
             except (Lost, CaseError, MeshError) as e:
                 note = f"{', '.join(settings)}: {e}" if settings else str(e)
                 return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
-            seen.values += [float(v) for v in found.values]
+            seen.values += [float(v) for v in readings.values]
             sizes = [float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters]  # type: ignore[arg-type]
-            sizes += [1.0] * (found.slopes.shape[1] - len(sizes))
-            seen.slopes += [list(map(float, row)) for row in found.slopes * sizes]
-            seen.curves = seen.curves or found.curves
+            sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
+            seen.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
+            seen.curves = seen.curves or readings.curves
         return seen
 
     def _scene(self, x: Array, settings: Settings, vectors: Path) -> Scene:

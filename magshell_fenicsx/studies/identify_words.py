@@ -16,7 +16,7 @@ UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 
 def sentences(content: dict[str, Any], fit: Fit, table: Table) -> list[str]:
     """What is found, in words."""
-    known = fit.known
+    measured = fit.known
     said, keys = list[str](), list(content["parameters"])
     for key, each in content["parameters"].items():
         unit = f" {each['unit']}" if each["unit"] else ""
@@ -31,9 +31,9 @@ def sentences(content: dict[str, Any], fit: Fit, table: Table) -> list[str]:
     for header, each in content["noise"].items():
         how = "estimated" if each["estimated"] else "given"
         said.append(f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}")
-    if not np.isnan(known.noise).any():
-        square = float((((known.data - fit.y) / fit.noise[table.column]) ** 2).sum())
-        if scipy.stats.chi2.sf(square, max(len(known.data), 1)) < UNLIKELY:
+    if not np.isnan(measured.noise).any():
+        square = float((((measured.data - fit.y) / fit.noise[table.column]) ** 2).sum())
+        if scipy.stats.chi2.sf(square, max(len(measured.data), 1)) < UNLIKELY:
             said.append(
                 f"warning: the misfit is {content['misfit_over_noise']:.3g} times the noise: the model does not "
                 "describe these data, or their noise is larger; leave it out to have it estimated"

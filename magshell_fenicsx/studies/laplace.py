@@ -182,7 +182,7 @@ class Fit:
 
 
 def fitted(
-    model: Model, known: Measured, start: Array, size: Array, most: int, told: Callable[[int, Array, float], None]
+    model: Model, measured: Measured, start: Array, size: Array, most: int, told: Callable[[int, Array, float], None]
 ) -> Fit:
     """The fit by Gauss-Newton; steps are halved until the misfit falls.
 
@@ -204,14 +204,14 @@ def fitted(
     """
     first = model(start)
     assert first, "there is a prediction at the start"
-    x, (y, J), given = np.array(start), first, known
-    known, noise, freedom = _weighed(given, known, x, y, J, _guessed(known, y), size)
+    x, (y, J), given = np.array(start), first, measured
+    measured, noise, freedom = _weighed(given, measured, x, y, J, _guessed(measured, y), size)
     ended = f"{most} steps"
     for step in range(most + 1):
-        rest, A = known.rows(y, J, x, noise)
+        rest, A = measured.rows(y, J, x, noise)
         _refuse_unseen(A * size)
         misfit = float(rest @ rest)
-        told(step, x, misfit / len(known.data))
+        told(step, x, misfit / len(measured.data))
         if step == most:
             break
         dx = size * np.linalg.lstsq(A * size, rest, rcond=None)[0]
@@ -224,20 +224,20 @@ def fitted(
             tried = x + dx / 2**halved
             there = model(tried)
             if there is not None:
-                after = known.rows(*there, tried, noise)[0]
+                after = measured.rows(*there, tried, noise)[0]
                 if after @ after < misfit:
                     break
         else:
             ended = "no step lowers the misfit"
             break
         x, (y, J) = tried, there
-        known, noise, freedom = _weighed(given, known, x, y, J, noise, size)
+        measured, noise, freedom = _weighed(given, measured, x, y, J, noise, size)
     if (silent := np.flatnonzero(freedom < SAID)).size:
         raise NoNoise(int(silent[0]))
-    covariance = _covariance(known.rows(y, J, x, noise)[1], size)
-    if known.field:
-        covariance = _Strength(given, known, x, y, J, noise, size).covariance()
-    return Fit(x, y, J, known.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended, known)
+    covariance = _covariance(measured.rows(y, J, x, noise)[1], size)
+    if measured.field:
+        covariance = _Strength(given, measured, x, y, J, noise, size).covariance()
+    return Fit(x, y, J, measured.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended, measured)
 
 
 def _covariance(A: Array, size: Array) -> Array:
@@ -256,22 +256,22 @@ def _refuse_unseen(A: Array) -> None:
         raise NotSeen(np.flatnonzero(np.abs(V[-1]) > NAMED))
 
 
-def _guessed(known: Measured, y: Array) -> Array:
+def _guessed(measured: Measured, y: Array) -> Array:
     """The noise of the columns; where it is to be estimated, the root mean square of the residuals."""
-    noise = np.array(known.noise)
+    noise = np.array(measured.noise)
     for column in np.flatnonzero(np.isnan(noise)):
-        noise[column] = np.sqrt(np.mean((known.data - y)[known.group == column] ** 2)) or 1.0
+        noise[column] = np.sqrt(np.mean((measured.data - y)[measured.group == column] ** 2)) or 1.0
     return noise
 
 
 def _weighed(
-    given: Measured, known: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
+    given: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
     """What is known, with the prior of the field as the data choose it; the noise, and its degrees of freedom."""
-    if known.field:
-        known, noise = _Strength(given, known, x, y, J, noise, size).best()
-        return known, noise, _estimated(known, y, J, noise, size)[1]
-    return known, *_estimated(known, y, J, noise, size)
+    if measured.field:
+        measured, noise = _Strength(given, measured, x, y, J, noise, size).best()
+        return measured, noise, _estimated(measured, y, J, noise, size)[1]
+    return measured, *_estimated(measured, y, J, noise, size)
 
 
 @dataclass(frozen=True)
@@ -318,16 +318,16 @@ class _Strength:
 
     def surprise(self, z: Array) -> float:
         """-2 ln p(d)."""
-        (known, noise), (rest, A) = self.weighed(z), self._rows(z)
-        assert known.field
+        (measured, noise), (rest, A) = self.weighed(z), self._rows(z)
+        assert measured.field
         Q, R = np.linalg.qr(A * self.size)
         least = rest @ rest - np.sum((Q.T @ rest) ** 2)
-        of_noise = 2 * np.log(noise[known.group]).sum()
-        return float(of_noise - known.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least)
+        of_noise = 2 * np.log(noise[measured.group]).sum()
+        return float(of_noise - measured.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least)
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
-        known, noise = self.weighed(z)
-        return known.rows(self.y, self.J, self.x, noise)
+        measured, noise = self.weighed(z)
+        return measured.rows(self.y, self.J, self.x, noise)
 
     def best(self) -> tuple[Measured, Array]:
         """The most likely ones."""
@@ -370,22 +370,22 @@ class _Strength:
         return total
 
 
-def _estimated(known: Measured, y: Array, J: Array, noise: Array, size: Array) -> tuple[Array, Array]:
+def _estimated(measured: Measured, y: Array, J: Array, noise: Array, size: Array) -> tuple[Array, Array]:
     """The noise of the columns, and the degrees of freedom of those that are estimated.
 
     A number takes as many degrees as its share in the parameters, the diagonal of J C J^T/s^2.
     """
-    found, freedom, s = np.array(known.noise), np.full(len(noise), np.inf), noise[known.group]
-    C = _covariance(np.vstack([J / s[:, None], known.prior]), size)
+    estimated, freedom, s = np.array(measured.noise), np.full(len(noise), np.inf), noise[measured.group]
+    C = _covariance(np.vstack([J / s[:, None], measured.prior]), size)
     share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
-    for column in np.flatnonzero(np.isnan(known.noise)):
-        own = known.group == column
+    for column in np.flatnonzero(np.isnan(measured.noise)):
+        own = measured.group == column
         freedom[column] = own.sum() - share[own].sum()
-        found[column] = max(
-            np.sqrt(((known.data - y)[own] ** 2).sum() / max(freedom[column], LEAST)),
-            EXACT * np.abs(known.data).max(),
+        estimated[column] = max(
+            np.sqrt(((measured.data - y)[own] ** 2).sum() / max(freedom[column], LEAST)),
+            EXACT * np.abs(measured.data).max(),
         )
-    return found, freedom
+    return estimated, freedom
 
 
 def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:

@@ -264,13 +264,13 @@ class OfShells(Law):
 
     def _there(self, values: Sequence[Scalar]) -> Scalar:
         """Of one value of each law that of the law at a place."""
-        found = values[0]
+        chosen = values[0]
         for i, value in enumerate(values[1:]):
             if isinstance(self.which, Expr):
-                found = ufl.conditional(ufl.gt(self.which, i + 0.5), value, found)
+                chosen = ufl.conditional(ufl.gt(self.which, i + 0.5), value, chosen)
             else:
-                found = np.where(np.asarray(self.which) > i + 0.5, value, found)
-        return found
+                chosen = np.where(np.asarray(self.which) > i + 0.5, value, chosen)
+        return chosen
 
 
 def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:

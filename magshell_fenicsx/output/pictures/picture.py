@@ -140,13 +140,13 @@ class Background:
         r, number = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
         if number is None:
             return ()
-        seen, found = self.seen.shows(r, 2 / self.window.scale), []
+        seen, names = self.seen.shows(r, 2 / self.window.scale), []
         for i, name in enumerate(self._surface.shells):
             places = self._camera(r[seen & (np.rint(number) == i)])[:, :2]
             if len(places):
                 x, y = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]
-                found.append((float(x), float(y), name))
-        return tuple(found)
+                names.append((float(x), float(y), name))
+        return tuple(names)
 
     def plain(self, grey: float) -> Image:
         """The shell in one grey, with what is beside it."""

@@ -120,7 +120,7 @@ def _of_face(F: Expr, t: Expr, s: Expr) -> Expr:
     return more * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + more / 2 * F[5])
 
 
-def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **known: Forms) -> Expr:
+def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms) -> Expr:
     """The pressure on the shell per undeformed area, at the state of P."""
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 

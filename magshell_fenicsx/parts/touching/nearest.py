@@ -60,10 +60,10 @@ class Cells:
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
         order = np.argsort(keys.ravel(), kind="stable")
         twice = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
-        found = np.full(keys.size, -1)
+        beyond = np.full(keys.size, -1)
         a, b = order[twice], order[twice + 1]
-        found[a], found[b] = b // 3, a // 3
-        return np.asarray(found.reshape(-1, 3))
+        beyond[a], beyond[b] = b // 3, a // 3
+        return np.asarray(beyond.reshape(-1, 3))
 
     @cached_property
     def lattice(self) -> tuple[Array, Array]:
@@ -256,15 +256,15 @@ def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
     trees = [scipy.spatial.cKDTree(centres[each]) for each in classes]
-    found = list[tuple[Longs, Longs]]()
+    pairs = list[tuple[Longs, Longs]]()
     for a, first in enumerate(classes):
         for b, second in enumerate(classes):
             most = radii[first].max() + radii[second].max() + reach
             near = trees[a].sparse_distance_matrix(trees[b], most, output_type="ndarray")
             i, j = first[near["i"]], second[near["j"]]
             fits = (near["v"] < radii[i] + radii[j] + reach) & (i != j)
-            found.append((i[fits], j[fits]))
-    i, j = (np.concatenate(each).astype(np.int64) for each in zip(*found, strict=True))
+            pairs.append((i[fits], j[fits]))
+    i, j = (np.concatenate(each).astype(np.int64) for each in zip(*pairs, strict=True))
     return i, j
 
 

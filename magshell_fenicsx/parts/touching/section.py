@@ -122,7 +122,7 @@ def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
 
 def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
     """The mean thickness of a pair over h; a patch is as thick as its shell."""
-    found = list[float]()
+    thicknesses = list[float]()
     for name in pair if thickness else ():
         of = _of_shells(name, thickness)
         if None in of or len({*of}) > 1:
@@ -130,8 +130,8 @@ def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None
                 f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "
                 "shells of different thickness one by one"
             )
-        found += [t for t in of[:1] if t is not None]
-    return sum(found) / len(found) if found else 1.0
+        thicknesses += [t for t in of[:1] if t is not None]
+    return sum(thicknesses) / len(thicknesses) if thicknesses else 1.0
 
 
 def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:

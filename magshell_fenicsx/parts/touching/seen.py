@@ -70,7 +70,7 @@ class TouchingSeen(Seen):
             for before in loads.pairs[:number]:
                 for one, other in (pair.names, pair.names[::-1]):
                     both = zip((one, other), before.names, strict=True)
-                    if all((inside[name] & inside[known]).any() for name, known in both):
+                    if all((inside[name] & inside[inner]).any() for name, inner in both):
                         raise MeshError(
                             f"contact: {pair.words}: shares cells with {before.words}: no place is in two pairs"
                         )

@@ -275,8 +275,8 @@ class Touching:
         size = len(first), self._r0.size
         G = scipy.sparse.coo_array((g.ravel(), (at_row, dofs.ravel())), size).tocsr()
         weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
-        found = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
-        return found.row.astype(np.int64), found.col.astype(np.int64), found.data
+        hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
+        return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
 
     def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
         """Distances, normals, and beta (n, functions of both cells) with its nodes."""
@@ -397,9 +397,9 @@ class Touching:
             beyond = cells.across[at.cell, side]
             asked = on[:, side] & (beyond >= 0)
             there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
-            known = keys[there] == at.point * number + beyond
+            listed = keys[there] == at.point * number + beyond
             nearer = at.distance[there] < at.distance - SAME * self._h
-            stays &= ~asked | (known & ~nearer)
+            stays &= ~asked | (listed & ~nearer)
         at = at.of(stays)
         if not len(at.point):
             return at
