@@ -45,17 +45,6 @@ HALVES: dict[str, tuple[str, dict[str, Any]]] = {
             "loading": dead(WEIGHT),
         },
     ),
-    "a plate pressed on another": (
-        "y",
-        {
-            "shells": {
-                "left": plate([0, 0, 0], boundary={"left": "clamped"}, points=TIP),
-                "right": plate([0.1, 0, -0.03], boundary={"right": "clamped"}),
-            },
-            "contact": [["left", "right"]],
-            "loading": dead({"over": "left", "per_area": [0, 0, -3e-7]}),
-        },
-    ),
     "tubes with one axis": (
         "oblique",
         {

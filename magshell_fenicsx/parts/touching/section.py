@@ -9,7 +9,7 @@ from pydantic import Field
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, everything, nothing
+from magshell_fenicsx.shape.symmetry import Leaves, nothing
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -69,12 +69,8 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """Planes of both shells of each pair: a place and the nearest one of the other shell are on one side of them.
-
-        A shell that may touch itself leaves none: it may touch its own mirror image.
-        """
-        mirrors = nothing if _touch_themselves(self.given, [*(context.sections.get("shells") or {})]) else everything
-        return [Leaves("contact: shells that may touch are modelled with their circumference", mirrors=mirrors)]
+        """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
+        return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
@@ -122,7 +118,7 @@ def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
 
 def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
     """The mean thickness of a pair over h; a patch is as thick as its shell."""
-    thicknesses = list[float]()
+    found = list[float]()
     for name in pair if thickness else ():
         of = _of_shells(name, thickness)
         if None in of or len({*of}) > 1:
@@ -130,8 +126,8 @@ def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None
                 f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "
                 "shells of different thickness one by one"
             )
-        thicknesses += [t for t in of[:1] if t is not None]
-    return sum(thicknesses) / len(thicknesses) if thicknesses else 1.0
+        found += [t for t in of[:1] if t is not None]
+    return sum(found) / len(found) if found else 1.0
 
 
 def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:
@@ -155,7 +151,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface", "the same thickness everywhere", "a thickness that does not change")
-    if symmetry == "axisymmetric" or (symmetry == "half" and _touch_themselves(given, shells)):
+    if symmetry in ("half", "axisymmetric"):
         raise ValueError(
             f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "
             "it between edges with boundary: symmetry"
@@ -164,15 +160,6 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
         _refuse_step(step, context)
     if context.sections.get("gradients"):
         raise ValueError("gradients: of shells that may touch each other are not built: leave out contact or gradients")
-
-
-def _touch_themselves(given: Sequence[Sequence[str]], shells: Sequence[str]) -> bool:
-    """Whether a pair is not of two shells."""
-
-    def of(name: str) -> str | None:
-        return next((shell for shell in shells if f"{name}_".startswith(f"{shell}_")), None)
-
-    return any(None in (of(one), of(other)) or of(one) == of(other) for one, other in given)
 
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
