@@ -40,9 +40,9 @@ class Dense:
 
     def times(self, v: Vector) -> Vector:
         """See `Rest`."""
-        here, everywhere = self.matrix.held
+        own, everywhere = self.matrix.held
         whole = np.where(everywhere, 0.0, np.concatenate(self.matrix.comm.allgather(v)))
-        return np.where(here, 0.0, sum(factor * (rows @ whole) for factor, rows in self.parts))
+        return np.where(own, 0.0, sum(factor * (rows @ whole) for factor, rows in self.parts))
 
     def scaled(self, factor: float) -> "Dense":
         """See `Rest`."""

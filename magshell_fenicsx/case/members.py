@@ -55,14 +55,14 @@ class Members:
         for plane in self._candidates(vectors, loosely):
             for side in (plane, plane.reversed):
                 kept = [self._kept(part, side, loosely) for part in self._several.parts]
-                if all(kept) and not any(_same(side, other) for other in mirrors):
+                if all(kept) and not any(side.is_plane_of(other) for other in mirrors):
                     named = zip(self._several.parts, kept, strict=True)
                     lost = {f"{p.name}_{a}": f"{p.name}_{b}" for p, own in named if own for a, b in own.lost.items()}
                     mirrors.append(replace(side, lost=lost))
         return mirrors
 
     def _member(self, part: "Part", plane: Mirror | None) -> Member:
-        """A shell, or its half at a plane in its own frame: that of its mesh is turned into the plane."""
+        """A shell, or its half at a plane in the frame of the shell. The frame of its mesh is turned about e3."""
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
         try:
@@ -82,7 +82,7 @@ class Members:
         offset = float(plane.offset - plane.normal @ place.position) / place.scale
         own = Mirror.of(place.Q.T @ plane.normal, offset)
         lost = {a.removeprefix(start): b.removeprefix(start) for a, b in plane.lost.items() if a.startswith(start)}
-        return replace(own, offset=0.0 if abs(own.offset) < ROUNDING else own.offset, lost=lost)
+        return replace(own, offset=_rounded(own.offset), lost=lost)
 
     def _kept(self, part: "Part", plane: Mirror, loosely: bool) -> Mirror | None:
         """The plane in the frame of a shell that is its own image in it; else None."""
@@ -121,10 +121,6 @@ class Members:
                 if one in held and other in held:
                     held[one] = held[other] = held[one] or held[other]
         return all(held.values())
-
-
-def _same(one: Mirror, other: Mirror) -> bool:
-    return bool(np.abs(one.normal - other.normal).max() < ROUNDING and abs(one.offset - other.offset) < ROUNDING)
 
 
 def _rounded(offset: float) -> float:

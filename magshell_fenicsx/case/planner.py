@@ -310,8 +310,8 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     vectors = [unit(v) for part in parts for v in part.vectors]
     planes = [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
     for one in planes:
-        same = np.abs(one.plane - plane.plane).max() < ROUNDING if one.plane.shape == plane.plane.shape else False
-        if same and all(abs(one.normal @ v) < ROUNDING for v in vectors) and all(part.mirrors(one) for part in parts):
+        along = all(abs(one.normal @ v) < ROUNDING for v in vectors)
+        if one.is_plane_of(plane) and along and all(part.mirrors(one) for part in parts):
             return one
     return None
 

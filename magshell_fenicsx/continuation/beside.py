@@ -100,10 +100,8 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
         doubt = max(doubt, float((np.abs(values) / np.abs(1 + values)).max()))
         if not len(far):
             return more, doubt
-        for i in far:
+        for i in far[values[far].imag >= 0]:  # of a conjugate pair one
             parts = [vectors[:, i].real, vectors[:, i].imag] if values[i].imag > 0 else [vectors[:, i].real]
-            if values[i].imag < 0:
-                continue
             vectors_of_value = [krylov.combined(part) for part in parts]
             if values[i].imag == 0 and values[i].real < -1:
                 more += 1 if energy(vectors_of_value[0]) < 0 else -1

@@ -55,6 +55,11 @@ class Mirror:
         unit = np.where(np.abs(unit) < ROUNDING, 0.0, unit)
         return cls(unit / np.linalg.norm(unit), offset / float(np.linalg.norm(normal)), lost or {})
 
+    def is_plane_of(self, other: "Mirror") -> bool:
+        """Whether both are the same half at the same plane, to rounding; edges may differ."""
+        normals = np.abs(self.normal - other.normal).max()
+        return bool(max(normals, abs(self.offset - other.offset)) < ROUNDING)
+
     @classmethod
     def upright(cls, azimuth: float) -> "Mirror":
         """The plane through e3 at an azimuth (rad)."""

@@ -106,7 +106,7 @@ class Site:
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
         of = density.work or density.of
-        self._varying[term.name] = [(at_points, on_batches(field, self._batches)) for at_points, field in varying]
+        self._varying[term.name] = [(target, on_batches(field, self._batches)) for target, field in varying]
 
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])

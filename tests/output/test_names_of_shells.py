@@ -1,4 +1,4 @@
-"""Several shells in pictures and files: each is told by its name."""
+"""Several shells in pictures and files: each has its name."""
 
 from pathlib import Path
 from typing import Any

@@ -50,8 +50,8 @@ class OwnMaterial:
 class Material:
     """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units.
 
-    `shells` are the materials of several shells by their names, of which the first has nu; None if all have one. `laws`
-    are theirs, the first one's at first, and `laminates` the plies by names.
+    Several shells: `shells` is name -> material, and nu is that of the first; None if all have the same. `laws` has the
+    law of each in their order, and `laminates` is name -> plies.
     """
 
     nu: float

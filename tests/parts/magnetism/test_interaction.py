@@ -348,13 +348,18 @@ def test_a_piece_that_is_not_held(model: Any, tmp_path: Path) -> None:
         Scene(case_of(tmp_path / "strips.msh", 0.1, boundary={"part0": "clamped"}))
 
 
+def rooted_strips(file: Path) -> None:
+    """Two parallel strips, the left end of the upper one as the edge root."""
+    strips(file, 4.0, 2.0, 1.5, 1.0)
+    root = gmsh.model.getEntitiesInBoundingBox(-0.1, -2, 1.4, 0.1, 2, 1.6, 1)
+    gmsh.model.addPhysicalGroup(1, [root[0][1]], name="root")
+    gmsh.write(str(file))
+
+
 @pytest.mark.slow
 def test_motion_in_a_neighbours_field(model: Any, tmp_path: Path) -> None:
     """A strip whose neighbour's field doubles swings: kinetic and stored energy are the work, 1e-3."""
-    strips(tmp_path / "strips.msh", 4.0, 2.0, 1.5, 1.0)
-    root = gmsh.model.getEntitiesInBoundingBox(-0.1, -2, 1.4, 0.1, 2, 1.6, 1)
-    gmsh.model.addPhysicalGroup(1, [root[0][1]], name="root")
-    gmsh.write(str(tmp_path / "strips.msh"))
+    rooted_strips(tmp_path / "strips.msh")
     shell = {"geometry": "mesh", "file": str(tmp_path / "strips.msh"), "unit": "mm", "radius": "5 mm"}
     shell |= {"thickness": "0.2 mm", "youngs_modulus": "20 MPa", "poisson_ratio": 0, "density": "1200 kg/m^3"}
     magnetic = {"interaction": "others", "remanent": {"polar": 30, "flux_density": f"{BR} T"}}
@@ -373,10 +378,7 @@ def test_motion_in_a_neighbours_field(model: Any, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
     """The deflection of a tip by the flux density of both strips: differences of whole runs, 1e-5."""
-    strips(tmp_path / "strips.msh", 4.0, 2.0, 1.5, 1.0)
-    root = gmsh.model.getEntitiesInBoundingBox(-0.1, -2, 1.4, 0.1, 2, 1.6, 1)
-    gmsh.model.addPhysicalGroup(1, [root[0][1]], name="root")
-    gmsh.write(str(tmp_path / "strips.msh"))
+    rooted_strips(tmp_path / "strips.msh")
 
     def ran(B: float) -> Any:
         magnetic = {"interaction": "others", "remanent": {"polar": 30, "flux_density": f"{B} T"}}
