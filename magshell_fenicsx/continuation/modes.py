@@ -184,18 +184,20 @@ class Mode:
     vector: Vector
 
 
-def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
+def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> list[Mode]:
     """The algebraically lowest eigenpairs of K phi = lambda M phi, ascending.
 
     Parameters
     ----------
     K
-        A symmetric tangent. It may be indefinite, but not exactly singular.
+        A symmetric tangent. It may be indefinite. Exactly singular it is only with the `kernel` that is given.
     M
         A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and columns for the held
         ones. Its sparsity pattern is part of that of K.
     count
         Number of eigenpairs. If there are more negative eigenvalues, all of these are returned.
+    kernel
+        Dimension of the kernel of a tangent that has no negative eigenvalue. Its eigenvalues are returned as zero.
 
     Raises
     ------
@@ -203,9 +205,11 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
         If Lanczos does not converge, or Sylvester's law says that some eigenvalues stay hidden.
     """
     slices = _Slices(K, M)
-    wanted = min(max(count, slices.below(0.0)), slices.finite)
+    zero = -slices.rounding if kernel else 0.0
+    wanted = min(max(count, kernel or slices.below(zero)), slices.finite)
     # (a) the eigenvalues nearest to zero give the order of magnitude
-    shift = -2 * max(abs(mode.eigenvalue) for mode in slices.around(0.0, wanted + 1, 1e-3))
+    nearest = slices.around(zero, wanted + kernel + 1, 1e-3)
+    shift = -2 * max(abs(mode.eigenvalue) for mode in nearest)
     # (b) a shift with nothing below it
     trials = 0
     while slices.below(shift):
@@ -220,7 +224,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
         above = last + MARGIN * (last - shift)
         missed = slices.below(above) - sum(mode.eigenvalue < above for mode in modes)
         if missed <= 0:
-            return modes[:wanted]
+            return [Mode(0.0, mode.vector) for mode in modes[:kernel]] + modes[kernel:wanted]
         sought += missed
     raise ModesNotFound(f"{missed} eigenvalues below {above:g} stay hidden from Lanczos")
 
@@ -251,6 +255,12 @@ class _Slices:
         self._factorisation = Factorisation(K.comm.tompi4py())
         self._sigma: float | None = None
         self.finite = K.comm.tompi4py().allreduce(int(np.count_nonzero(M.getDiagonal().array_r)))
+
+    @property
+    def rounding(self) -> float:
+        """What rounding may make of an eigenvalue that is zero."""
+        norm = PETSc.NormType.INFINITY
+        return float(ROUNDING * self._K.norm(norm) / self._M.norm(norm))
 
     def below(self, sigma: float) -> int:
         """The number of eigenvalues below sigma: negative pivots of K - sigma M."""

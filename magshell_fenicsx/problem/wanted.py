@@ -30,6 +30,7 @@ class FrequenciesSection(Section):
     """Natural frequencies of small vibrations about points of the path, under the loads of each point.
 
     frequencies.csv lists ω² ρ R²/E, negative where the shell is unstable, and with `shell.density` hertz.
+    A shell that nothing loads needs no support: its rigid motions are listed with ω² = 0.
     """
 
     count: int = Field(default=6, ge=1, le=50)

@@ -105,7 +105,8 @@ class _Writer:
         for number, state in points.items():
             on, shell, _ = self._all_of(number)
             try:
-                lowest = shell.lowest(on.state(state), wanted.modes)
+                loose = self.result.scene_of(number).loose
+                lowest = shell.lowest(on.state(state), wanted.modes, loose=loose)
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
                 by_point[number] = lowest[: max(wanted.modes, unstable)]
             except ModesNotFound as e:
@@ -214,7 +215,7 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         seen[number], own[number] = on, own_wave(on.model)
         state = rigid(scene, state)
         try:
-            result.frequencies[number] = modes = shell.vibrations(on.state(state), section.count)
+            result.frequencies[number] = modes = shell.vibrations(on.state(state), section.count, loose=scene.loose)
             if scene.model.contacts:
                 result.contact_changes[number] = changes = contact_changes(scene, state, modes)
                 for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
@@ -223,11 +224,14 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         except ModesNotFound as e:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
-        first = modes[0]
+        rigid_modes = [mode for mode in modes if mode.eigenvalue == 0.0] if scene.loose else []
+        motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)  # a wave has a twin
+        free = f"{motions} rigid motions, " if motions else ""
+        first = modes[min(len(rigid_modes), len(modes) - 1)]
         f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own[number])
         in_hertz = "" if f is None else f", {f:.6g} Hz"
         of_mode = f", m = {wave}" if wave.isdigit() else wave and f", {wave}"
-        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}")
+        say(f"{free}lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}")
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):

@@ -219,8 +219,8 @@ class MeridianModel(Thin):
         """Coordinates (n, 1) of the nodes along the meridian."""
         return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
 
-    def refuse_loose(self, amplitudes: Amplitudes) -> None:
-        self.held.refuse_loose(self.r0)
+    def free_motion(self, amplitudes: Amplitudes) -> str:
+        return self.held.free_motion(self.r0)
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""

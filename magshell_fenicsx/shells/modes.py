@@ -12,14 +12,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.parts.supports.supports import rigid_motions
 from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, weight
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
@@ -81,6 +84,8 @@ class _Family:
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
     contains: Callable[[Vector], bool] = lambda vector: True
+    rigid: int = 0  # dimension of the kernel: rigid motions of the undeformed shell that nothing holds
+    motion: Vector | None = None  # the one of them that the family contains, where it is not all of the kernel
 
 
 @dataclass
@@ -90,22 +95,23 @@ class ShellModes:
     model: Model
     _products: dict[str, fem.Form] = field(default_factory=dict)
 
-    def lowest(self, state: State, count: int) -> list[ShellMode]:
+    def lowest(self, state: State, count: int, *, loose: bool = False) -> list[ShellMode]:
         """The lowest modes, ascending: of every family `count`, and all that are negative.
 
         Of a tangent that is not symmetric, those of its symmetric part.
 
-        Waves count once, though each has a twin turned by a quarter of its length. Compiles a mass matrix
-        when it is first called, and the waves' kernels.
+        Waves count once, though each has a twin turned by a quarter of its length. If the state is the undeformed one
+        of a `loose` shell, its rigid motions are among them, with an eigenvalue of exactly zero. Compiles a mass
+        matrix when it is first called, and the waves' kernels.
 
         Raises
         ------
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
-        return self._lowest(_families(self.model), state, count)
+        return self._lowest(_families(self.model, rest=state if loose else None), state, count)
 
-    def vibrations(self, state: State, count: int) -> list[ShellMode]:
+    def vibrations(self, state: State, count: int, *, loose: bool = False) -> list[ShellMode]:
         """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are omega^2 rho R^2/E.
 
         The mass is consistent, without rotary inertia, and that of the drawn shell. On the meridian vibrations around
@@ -116,7 +122,7 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
-        lowest = self._lowest(_families(self.model, vibrating=True), state, count)
+        lowest = self._lowest(_families(self.model, vibrating=True, rest=state if loose else None), state, count)
         return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
 
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
@@ -124,7 +130,11 @@ class ShellModes:
         for family in families:
             M = mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
-            modes = lowest_modes(symmetric_part(family.tangent(state)), M, count)
+            modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
+            if family.contains is _turns:  # of a kernel with the motion along the axis
+                modes = modes[family.rigid :]
+            if family.motion is not None:
+                of_families.append(ShellMode(family.label, 0.0, _normalised(family.motion, M)))
             of_families += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
         return sorted(of_families, key=lambda mode: mode.eigenvalue)
 
@@ -152,28 +162,56 @@ class ShellModes:
         return self._products[name]
 
 
-def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
+def _families(model: Model, *, vibrating: bool = False, rest: State | None = None) -> Iterator[_Family]:
     """The modes that the model sees, then those that it excludes, whose kernels are compiled by then.
 
-    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
+    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian. `rest` is the
+    undeformed state of a shell that is not held, whose rigid motions are counted.
     """
     of_mass = weight(model) if vibrating else None
     factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
     mass = f"{name}mass", of_displacements(model, factor)
 
-    def of(label: str, system: FiniteElementSystem) -> _Family:
-        return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection)
+    def of(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
+        return _Family(
+            label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection, rigid=rigid
+        )
 
-    yield of("", model.system)
     if isinstance(model, MeridianModel):
+        free = model.held.rigid_motions(model.r0) if rest else dict.fromkeys((-1, 0, 1), 0)
+        yield of("", model.system, free[0])
         waves = model.excluded_modes.waves
         wave_mass = f"{name}wave mass", of_waves(model, factor)
         if vibrating:
-            yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
+            rho = model.r0.x.array[::2]
+            yield _Family(
+                TORSION,
+                partial(waves.tangent, m=0),
+                waves.held(0),
+                wave_mass,
+                contains=_turns,
+                rigid=free[-1] + free[0],  # its space has the motion along e3 too
+                motion=np.column_stack([rho, rho, 0 * rho]).ravel() if free[-1] else None,
+            )
         for m in range(1, waves.largest + 1):
-            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass)
-    elif isinstance(model.excluded_modes, AntisymmetricModes):
-        yield of("antisymmetric", model.excluded_modes.system)
+            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=free.get(m, 0))
+        return
+
+    def free_of(system: FiniteElementSystem) -> int:
+        return rigid_motions(system, model.r0, rest.mu) if rest else 0
+
+    yield of("", model.system, free_of(model.system))
+    if isinstance(model.excluded_modes, AntisymmetricModes):
+        other = model.excluded_modes.system
+        yield of("antisymmetric", other, free_of(other))
+
+
+def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
+    """The vector, on one rank, divided so that phi . M phi = 1."""
+    phi, product = M.createVecs()
+    phi.setArray(vector)
+    M.mult(phi, product)
+    return np.asarray(vector / np.sqrt(phi.dot(product)))
 
 
 def _turns(coefficients: Vector) -> bool:

@@ -27,7 +27,7 @@ from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
-from magshell_fenicsx.parts.supports.supports import refuse_loose
+from magshell_fenicsx.parts.supports.supports import free_motion
 from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.shells.terms import EnergyFactory
 
@@ -128,15 +128,9 @@ class Observed:
         self.load_size[name] = dead.size
         return LinearTerm(name, *dead.entries, self.u, name)
 
-    def refuse_loose(self, amplitudes: Amplitudes) -> None:
-        """See that no rigid motion is left free; collective.
-
-        Raises
-        ------
-        MeshError
-            On every rank, with the motion.
-        """
-        refuse_loose(self.system, self.r0, amplitudes)
+    def free_motion(self, amplitudes: Amplitudes) -> str:
+        """A rigid motion that is left free, as a message; empty if there is none. Collective."""
+        return free_motion(self.system, self.r0, amplitudes)
 
     def zero(self) -> Vector:
         """The undeformed displacement."""

@@ -23,6 +23,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0, rotation
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.parts.magnetism.fields import strength
@@ -70,7 +71,7 @@ def build_meridian_model(problem: Problem) -> MeridianModel:
     points = {name: span.place(x) for name, x in problem.points.items()}
     vertices = meridian_vertices(problem)
     meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
-    model = MeridianModel(
+    return MeridianModel(
         meridian,
         problem.material,
         problem.mesh.degree,
@@ -79,8 +80,6 @@ def build_meridian_model(problem: Problem) -> MeridianModel:
         problem.mesh.penalty,
         problem.thickness,
     )
-    model.refuse_loose({})
-    return model
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> SolidModel:
@@ -119,6 +118,8 @@ class Scene:
         runs the scene sets both.
     warnings
         What is unphysical, or may be too large.
+    loose
+        Whether rigid motions may be left free: those of a shell that nothing loads, which has frequencies.
     setup_s
         Time to build the scene in seconds, without compiling kernels.
     """
@@ -140,8 +141,10 @@ class Scene:
             self.model = build_model(self.problem, comm)
         surface = self.model.midsurface
         several = surface is not None and surface.read  # a file may have pieces, of which each must be held
-        if not self.model.axisymmetric and (several or not self.problem.fixed):
-            self.model.refuse_loose(self.unloaded().mu)
+        unsure = self.model.axisymmetric or several or not self.problem.fixed
+        if unsure and self.problem.programme and (motion := self.model.free_motion(self.unloaded().mu)):
+            raise MeshError(motion)
+        self.loose = unsure and not self.problem.programme
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
         options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts or self.model.touchings else None

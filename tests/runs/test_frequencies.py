@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from command import magshell
 from conftest import CASES
+from numpy.polynomial import Legendre
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 from scipy.special import ive, jv
@@ -73,6 +76,57 @@ def test_clamped_strip() -> None:
     assert exact == pytest.approx([3.5160, 22.0345], rel=1e-5)
     found = of_plate(scene_of(shell, {"root": "clamped"}, symmetry="half"), 3, label="")
     assert found[:2] == pytest.approx(exact, rel=1e-4)
+
+
+def free_square(nu: float, order: int = 12) -> list[float]:
+    """omega a^2 sqrt(rho h/D) of the vibrations of a free square plate, by Ritz's method with Legendre polynomials."""
+    x, weight = leggauss(order + 2)
+    of = [Legendre.basis(n) for n in range(order)]
+    p = [np.array([f(x) for f in of])] + [np.array([f.deriv(d)(x) for f in of]) for d in (1, 2)]
+
+    def integral(i: int, j: int) -> NDArray[np.float64]:
+        return np.asarray((p[i] * weight) @ p[j].T)
+
+    zero, one, two, mixed = integral(0, 0), integral(1, 1), integral(2, 2), integral(2, 0)
+    K = np.kron(two, zero) + np.kron(zero, two) + nu * (np.kron(mixed, mixed.T) + np.kron(mixed.T, mixed))
+    K += 2 * (1 - nu) * np.kron(one, one)
+    return list(4 * np.sqrt(eigh(K, np.kron(zero, zero), eigvals_only=True)[3:12]))  # a side of the square is 2
+
+
+@pytest.mark.parametrize("symmetry", ["half", "none"])
+def test_a_free_plate_has_six_rigid_motions_before_it_vibrates(symmetry: str) -> None:
+    scene = Scene(Case.load(CASES / "free_plate.yaml", [f"symmetry={symmetry}"]))
+    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 11, loose=scene.loose)
+    D = scene.problem.material.bending_stiffness
+    values = [mode.eigenvalue for mode in modes]
+    assert values[:6] == [0.0] * 6
+    assert np.sqrt(np.array(values[6:]) / D) == pytest.approx(free_square(0.3)[:5], rel=1e-4)
+
+
+def free_disc(n: int, first: float, last: float, nu: float) -> float:
+    """k^2 between two bounds: a circular plate without moment and shear force at its rim (Leissa, equation 2.10)."""
+
+    def determinant(k: float) -> float:
+        J, I = jv(n, k), ive(n, k)  # noqa: E741
+        dJ, dI = (jv(n - 1, k) - jv(n + 1, k)) / 2, (ive(n - 1, k) + ive(n + 1, k)) / 2
+        moments = [k**2 * f + sign * (1 - nu) * (k * df - n**2 * f) for f, df, sign in ((J, dJ, 1), (I, dI, -1))]
+        shears = [k**3 * df + sign * (1 - nu) * n**2 * (k * df - f) for f, df, sign in ((J, dJ, 1), (I, dI, -1))]
+        return float(moments[0] * shears[1] - moments[1] * shears[0])
+
+    return float(brentq(determinant, first, last, xtol=1e-12)) ** 2
+
+
+def test_a_free_disc_as_a_meridian() -> None:
+    """Along and around its axis it moves freely, and across it; then it vibrates with n = 2, 0 and 3."""
+    shell = {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.33}
+    scene = scene_of(shell, {"rim": "free"}, frequencies={})
+    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 7, loose=scene.loose)
+    assert [mode.label for mode in modes] == ["", "torsion", "m = 1", "m = 1", "m = 2", "", "m = 3"]
+    assert [mode.eigenvalue for mode in modes[:4]] == [0.0] * 4
+    exact = [free_disc(n, *b, nu=0.33) for n, b in ((2, (2, 2.6)), (0, (2.7, 3.3)), (3, (3.2, 3.8)))]
+    assert exact == pytest.approx([5.253, 9.084, 12.23], rel=2e-3)  # Leissa, table 2.5
+    D = scene.problem.material.bending_stiffness
+    assert [np.sqrt(mode.eigenvalue / D) for mode in modes[4:]] == pytest.approx(exact, rel=1e-4)
 
 
 def of_cylinder(n: int, k: float, h: float, nu: float) -> float:

@@ -212,12 +212,14 @@ def _once(axes: "Axes", name: str) -> str:
     return "_" if name in axes.get_legend_handles_labels()[1] else name
 
 
+TORSION = "torsion"  # the wave of a frequency around the axis
 NAMED = 12  # most waves in the legend
 
 
 def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection) -> "Figure":
     """Frequencies over the amplitude that varied last; the n-th lowest of each wave is one line.
 
+    Of one point alone over the number of waves, where all have one, else over the number of the mode.
     In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
     """
     from matplotlib.figure import Figure
@@ -229,20 +231,30 @@ def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], st
     of_root = max((it.hertz / np.sqrt(it.omega2) for it in vibrating), default=0.0)  # Hz; 0 without a density
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
-    for it in (it for it in frequencies if it.point in places):
+    drawn = [it for it in frequencies if it.point in places]
+    alone, of_waves = len({it.point for it in drawn}) == 1, all(it.wave.isdigit() for it in drawn if it.wave != TORSION)
+    for n, it in enumerate(drawn, 1):
         signed = np.sign(it.omega2) * of_root * np.sqrt(abs(it.omega2)) if of_root else it.omega2
-        lines[it.wave, count[it.point, it.wave]].append((places[it.point], float(signed)))
+        place = (int(it.wave) if it.wave.isdigit() else 0) if of_waves else n
+        lines[it.wave, count[it.point, it.wave]].append((place if alone else places[it.point], float(signed)))
         count[it.point, it.wave] += 1
     width = (style.width or ONE) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
     axes, waves = figure.subplots(), list(dict.fromkeys(wave for wave, _ in lines))
-    for (wave, number), points in sorted(lines.items()):
+    if spectrum := alone and of_waves:
+        waves = ["waves", *({TORSION} & set(waves))]
+    for (wave, number), points in lines.items():
+        wave = "waves" if spectrum and wave != TORSION else wave
         named = wave if number == 0 and waves.index(wave) < NAMED else None
         axes.plot(*zip(*points, strict=True), ".-", color=f"C{waves.index(wave) % 10}", label=named, lw=1, ms=4)
     axes.axhline(0, color="0.6", lw=0.6)
     grows = "; below zero it grows" if any(it.omega2 < 0 for it in frequencies) else ""
     said = f"frequency  (Hz){grows}"
-    axes.set(xlabel=column.label if column else "", ylabel=said if of_root else r"$\omega^2 \rho R^2/E$")
-    if waves != [""]:
+    of_one = "waves around the axis" if of_waves else "number of the mode"
+    of_path = column.label if column else ""
+    axes.set(xlabel=of_one if alone else of_path, ylabel=said if of_root else r"$\omega^2 \rho R^2/E$")
+    if alone:
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    if waves not in ([""], ["waves"]):
         figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
     return figure

@@ -11,7 +11,7 @@ from magshell_fenicsx.mesh.mirror import STRAIGHT
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.parts.supports.supports import RIGHT, no_mirror
+from magshell_fenicsx.parts.supports.supports import NOT_HELD, RIGHT, no_mirror
 
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
@@ -48,27 +48,30 @@ class Supports:
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
 
-    def refuse_loose(self, r0: fem.Function) -> None:
-        """See that no rigid motion is left free; nothing but supports holds an unloaded shell.
+    def rigid_motions(self, r0: fem.Function) -> dict[int, int]:
+        """The number of rigid motions that no support stops of m = 0 and 1: along and around e3, across and about e1.
 
-        Raises
-        ------
-        MeshError
-            With the motion.
+        Of m = 0 the motion along e3 is 1, that around it is counted under -1. Each of m = 1 has a twin.
         """
-
-        def places(facets: Facets) -> NDArray[np.float64]:
-            dofs = fem.locate_dofs_topological(r0.function_space, 0, facets)
-            return np.asarray(r0.x.array.reshape(-1, 2)[dofs])
-
-        if not len(self.axial):
-            raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
         # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
-        rows = [[1.0, z] for _, z in places(self.horizontal)] + [[0.0, rho] for rho, _ in places(self.axial)]
-        stopped = np.linalg.matrix_rank(np.array(rows), tol=1e-9)
-        if stopped < 2:
-            motion = "turn" if len(self.horizontal) else "move along (1, 0, 0)"
-            raise MeshError(f"boundary: the shell is not held: it is free to {motion}")
+        rows = [[1.0, z] for _, z in self._places(r0, self.horizontal)]
+        rows += [[0.0, rho] for rho, _ in self._places(r0, self.axial)]
+        stopped = np.linalg.matrix_rank(np.array(rows), tol=1e-9) if rows else 0
+        return {0: int(not len(self.axial)), -1: int(not len(self.horizontal)), 1: int(2 - stopped)}
+
+    def free_motion(self, r0: fem.Function) -> str:
+        """A rigid motion that is left free, as a message; empty if there is none. Nothing but supports holds it."""
+        free = self.rigid_motions(r0)
+        if free[0]:
+            return NOT_HELD + "move along (0, 0, 1)"
+        if free[1]:
+            return NOT_HELD + ("turn" if len(self.horizontal) else "move along (1, 0, 0)")
+        return ""
+
+    @staticmethod
+    def _places(r0: fem.Function, facets: Facets) -> NDArray[np.float64]:
+        dofs = fem.locate_dofs_topological(r0.function_space, 0, facets)
+        return np.asarray(r0.x.array.reshape(-1, 2)[dofs])
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:

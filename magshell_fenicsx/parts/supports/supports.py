@@ -29,6 +29,7 @@ ROUNDING = 1e-9
 BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
+NOT_HELD = "boundary: the shell is not held: it is free to "
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
 
@@ -170,24 +171,40 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
     return np.concatenate(V.mesh.comm.allgather(np.reshape(conormals, (-1, 3))))
 
 
-def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:
-    """See that no rigid motion is left free, of no piece of the shell; collective.
-
-    Raises
-    ------
-    MeshError
-        On every rank; the message tells the motion.
-    """
-    piece = pieces(r0.function_space)[: system.size // 3]
-    count = 1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX)
-    for number in range(count):
-        _refuse_loose(system, r0, amplitudes, piece == number, whole=count == 1)
-
-
-def _refuse_loose(
-    system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes, own: NDArray[np.bool_], *, whole: bool
-) -> None:
+def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> str:
+    """A rigid motion of a piece of the shell that is left free, as a message; empty if there is none. Collective."""
     x = r0.x.array[: system.size].reshape(-1, 3)
+    pieces_of_shell = _pieces(system, r0)
+    for own in pieces_of_shell:
+        motions = _loose(system, x, amplitudes, own)
+        if not len(motions):
+            continue
+        total = system.comm.allreduce(int(own.sum()))
+        shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / total
+        moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
+        centre = system.comm.allreduce(x[own].sum(axis=0)) / total
+        along = ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3)) if moves else ""
+        where = "" if len(pieces_of_shell) == 1 else f"; this is its piece around {place_text(centre)}, over R"
+        return NOT_HELD + (f"move along ({along})" if moves else "turn") + where
+    return ""
+
+
+def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> int:
+    """The number of rigid motions that nothing resists, of all pieces of the shell together; collective."""
+    x = r0.x.array[: system.size].reshape(-1, 3)
+    return sum(len(_loose(system, x, amplitudes, own)) for own in _pieces(system, r0))
+
+
+def _pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
+    """Which nodes of this rank each piece of the shell has; collective."""
+    piece = pieces(r0.function_space)[: system.size // 3]
+    return [piece == n for n in range(1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX))]
+
+
+def _loose(
+    system: FiniteElementSystem, x: Array, amplitudes: Amplitudes, own: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The rigid motions (k, unknowns) of the nodes of a piece that nothing resists, the loosest first; collective."""
     total = system.comm.allreduce(int(own.sum()))
     centre = system.comm.allreduce(x[own].sum(axis=0)) / total
     motions = np.zeros((6, *x.shape))
@@ -199,7 +216,7 @@ def _refuse_loose(
     _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
     free = vectors[values < FREE * max(values.max(), 1.0)] @ rigid
     if not len(free):
-        return
+        return free
     free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
     K = symmetric_part(system.tangent(np.zeros(system.size), amplitudes))
     out, energies = K.createVecLeft(), []
@@ -209,19 +226,8 @@ def _refuse_loose(
         K.mult(given, out)
         energies.append(system.comm.allreduce(free @ out.array))
     values, vectors = np.linalg.eigh(np.array(energies))
-    if values[0] < LOOSE * K.norm(PETSc.NormType.INFINITY):
-        said = vectors[:, 0] @ free
-        shift = system.comm.allreduce(said.reshape(-1, 3).sum(axis=0)) / total
-        moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
-        raise MeshError(
-            "boundary: the shell is not held: it is free to "
-            + (
-                f"move along ({', '.join(f'{c + 0.0:.2g}' for c in np.round(shift / np.linalg.norm(shift), 3))})"
-                if moves
-                else "turn"
-            )
-            + ("" if whole else f"; this is its piece around {place_text(centre)}, over R")
-        )
+    loose: NDArray[np.float64] = vectors.T[values < LOOSE * K.norm(PETSc.NormType.INFINITY)] @ free
+    return loose
 
 
 def supports(
