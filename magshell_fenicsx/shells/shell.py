@@ -215,13 +215,15 @@ class ShellModel(Thin):
                 )
                 terms.append(factory.term(factory.clamped_edges(edge, midsurface.edges[name], turn)))
             if name in midsurface.edges:
-                here = held_on(V, 1, midsurface.edges[name], components)
+                conditions_of_part = held_on(V, 1, midsurface.edges[name], components)
             elif name in midsurface.patches:
-                here = held_on(V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components)
+                conditions_of_part = held_on(
+                    V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components
+                )
             else:
-                here = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
-            held += here
-            self.supports[name] = Support.of(here, edge, turn)
+                conditions_of_part = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
+            held += conditions_of_part
+            self.supports[name] = Support.of(conditions_of_part, edge, turn)
         self.supports |= on_planes
         self.planes = tuple(planes)
         closing = closing_point(planes)

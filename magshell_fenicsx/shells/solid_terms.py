@@ -273,9 +273,9 @@ class TermFactory:
             parts = {"whole": low > MIDDLE - ROUNDING, "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING)}
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
-                    here, upper = facets[inside], name == "upper"
+                    facets_of_part, upper = facets[inside], name == "upper"
                     of_faces[f"pressure {name}"] = Density(
-                        on_end, parameters, VALUE + GRADIENT, WHOLE, "end", here, upper, end_work
+                        on_end, parameters, VALUE + GRADIENT, WHOLE, "end", facets_of_part, upper, end_work
                     )
         return of_faces
 

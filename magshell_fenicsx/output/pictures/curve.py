@@ -223,6 +223,7 @@ def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], st
     In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
     column = shown(registered(varied).column, rows[0]) if varied else None
@@ -254,7 +255,7 @@ def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], st
     of_path = column.label if column else ""
     axes.set(xlabel=of_one if alone else of_path, ylabel=said if of_root else r"$\omega^2 \rho R^2/E$")
     if alone:
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if waves not in ([""], ["waves"]):
         figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
     return figure

@@ -216,7 +216,7 @@ def _loose(
     _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
     free = vectors[values < FREE * max(values.max(), 1.0)] @ rigid
     if not len(free):
-        return free
+        return np.asarray(free)
     free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
     K = symmetric_part(system.tangent(np.zeros(system.size), amplitudes))
     out, energies = K.createVecLeft(), []
@@ -226,8 +226,7 @@ def _loose(
         K.mult(given, out)
         energies.append(system.comm.allreduce(free @ out.array))
     values, vectors = np.linalg.eigh(np.array(energies))
-    loose: NDArray[np.float64] = vectors.T[values < LOOSE * K.norm(PETSc.NormType.INFINITY)] @ free
-    return loose
+    return np.asarray(vectors.T[values < LOOSE * K.norm(PETSc.NormType.INFINITY)] @ free)
 
 
 def supports(
