@@ -187,15 +187,11 @@ def boundary(
     """Follow the fold or bifurcation at the end of a case in a second key, through cusps; keep points in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
-    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
     from magshell_fenicsx.studies.boundary_map import boundary_map
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        if len(over) == 1:
-            done = follow_boundary(case, over[0], set_ or [], folder, made=_made, start=from_)
-        else:
-            done = boundary_map(case, over, set_ or [], folder, made=_made, start=from_)
+        done = boundary_map(case, over, set_ or [], folder, made=_made, start=from_)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)

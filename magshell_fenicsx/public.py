@@ -122,13 +122,10 @@ def boundary(
     `start` is another one: "DIR:POINT", a fold or bifurcation of the run in a folder. With two keys, it is followed in
     the first for each value of the second: `studies.boundary_map.boundary_map`.
     """
-    from magshell_fenicsx.studies.boundary import boundary as follow_boundary
     from magshell_fenicsx.studies.boundary_map import boundary_map
 
-    if not isinstance(over, str) and len(over) != 1:
-        return boundary_map(file, over, settings, out, comm, say, made=Case.from_source, start=start)
-    over = over if isinstance(over, str) else over[0]
-    return follow_boundary(file, over, settings, out, comm, say, made=Case.from_source, start=start)
+    overs = [over] if isinstance(over, str) else over
+    return boundary_map(file, overs, settings, out, comm, say, made=Case.from_source, start=start)
 
 
 def identify(

@@ -53,6 +53,19 @@ def whole(f: fem.Function) -> NDArray[np.float64]:
     return over_ranks(V.mesh.comm, f.x.array[: size * V.dofmap.index_map.size_local].reshape(-1, size))
 
 
+def add_own(b: NDArray[np.float64], forces: NDArray[np.float64], own: tuple[int, int], comm: MPI.Comm) -> None:
+    """Add the forces (nodes, 3) that ranks have on any nodes to the local vectors of their owners; collective.
+
+    Parameters
+    ----------
+    own
+        Number of the first degree of freedom of this rank, and how many it has.
+    """
+    start, size = own
+    summed = np.asarray(comm.allreduce(forces)) if comm.size > 1 else forces
+    b[:size] += summed.ravel()[start : start + size]
+
+
 def pieces(V: fem.FunctionSpace) -> NDArray[np.int32]:
     """The number of the piece of each local node, ghosts included, the same on all ranks; collective."""
     comm, index, cells = V.mesh.comm, V.dofmap.index_map, V.dofmap.list

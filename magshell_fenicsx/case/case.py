@@ -1,6 +1,6 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
@@ -21,9 +21,8 @@ from pydantic import (
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
 from magshell_fenicsx.case.merged import expanded, written
 from magshell_fenicsx.case.shells import Several, Shells
-from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, texts
+from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, numbers_with_units
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.press import approaches
@@ -52,6 +51,8 @@ if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
 Waves = Annotated[int, Field(ge=1, le=200)]
+LIKE_THE_SHELL = ("mesh", "points", "sensors", "natural", "bodies", "joints", "loading", *PARTS)
+"""Sections whose numbers have units where the shell's lengths have."""
 
 
 class Case(WithParts):
@@ -133,18 +134,17 @@ class Case(WithParts):
             section._several = several
             section.shell.files.given[section.shell.path] = several.assembly
         if isinstance(data, dict) and not section.shell.with_units:
-            parts = {key: data.get(key) for key in ("mesh", *PARTS)} | _places(data)
-            written = listed(data.get("loading"))
-            for key, load in listed(section.loading).items():
-                if load.measured and isinstance(written[key], dict):
-                    parts[key] = {name: value for name, value in written[key].items() if name != "hold"}
-            abilities = section.context.abilities
-            for key in (
-                *texts(parts, is_formula),
-                *(length for ability in abilities for length in ability.lengths(data)),
-            ):
+            for key in section._with_units(data):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
+
+    def _with_units(self, data: Mapping[str, Any]) -> Iterator[str]:
+        """The keys of its plain data that have units as lengths of the shell have."""
+        for key in LIKE_THE_SHELL:
+            yield from numbers_with_units(getattr(self, key), data.get(key), key)
+        shell = data.get("shell")
+        for key in ("imperfections", "defect") if isinstance(shell, Mapping) else ():
+            yield from numbers_with_units(getattr(self.shell, key, None), shell.get(key), f"shell.{key}")
 
     @model_validator(mode="after")
     def _abilities_fit(self) -> Self:
@@ -307,10 +307,3 @@ class Case(WithParts):
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
             raise InvalidCase(e.errors(), source, cls) from None
-
-
-def _places(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The places of plain data by their keys; what they are called has no meaning."""
-    sensors = {name: each for name, each in (data.get("sensors") or {}).items() if isinstance(each, dict)}
-    places = {f"points.{name}": place for name, place in (data.get("points") or {}).items()}
-    return places | {f"sensors.{name}.position": each.get("position") for name, each in sensors.items()}

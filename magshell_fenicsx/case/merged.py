@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from magshell_fenicsx.case.shells import OneOfShells, Part, Several, Shells
-from magshell_fenicsx.input.section import Section, texts
+from magshell_fenicsx.input.section import Section, numbers_with_units
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.shape.sections import ShellSection
@@ -53,7 +53,7 @@ def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -
     for name in sections:
         _refuse_name(name, sections)
     parts = [
-        Part(name, section, _case(name, data, {**around}, case)) for name, section in sections.items()
+        Part(name, section, _case(name, section, data, {**around}, case)) for name, section in sections.items()
     ]  # in the order of the file
     several = Several(parts, _joined(_renamed(data.get("joints"), sections)))
     first = _merged(parts)
@@ -90,7 +90,7 @@ def _refuse_name(name: str, names: Mapping[str, OneOfShells]) -> None:
         raise ValueError(f"shells: {other}: begins as {name}_ does, by which edges of {name} are named: rename one")
 
 
-def _case(name: str, data: Keys, context: Keys, case: "type[Case]") -> "Case":
+def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "type[Case]") -> "Case":
     """That of one shell alone."""
     given, mesh = data["shells"][name], data.get("mesh") or {}
     given = given.model_dump(exclude_unset=True) if isinstance(given, BaseModel) else given
@@ -118,7 +118,7 @@ def _case(name: str, data: Keys, context: Keys, case: "type[Case]") -> "Case":
         error = e.errors()[0]
         said, key = error["msg"].removeprefix("Value error, "), ".".join(map(str, error["loc"]))
         raise ValueError(f"shells.{name}.{f'{key}: ' if key else ''}{said}") from None
-    if not made.shell.with_units and [*texts(given.get("place"))]:
+    if not made.shell.with_units and [*numbers_with_units(section.place, given.get("place"), "place")]:
         raise ValueError(f"shells.{name}.place: has a unit, but the shell's lengths have none: give all one, or none")
     return made
 

@@ -11,7 +11,7 @@ from functools import cache, reduce
 from math import isnan, nan
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from pydantic import (
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
 
@@ -165,17 +166,30 @@ def or_number(unit: str, number: Any = float) -> WithUnit:
     return WithUnit(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
 
 
-def lengths_with_units(section: type[BaseModel], data: Mapping[str, Any], path: str = "") -> Iterator[str]:
-    """The keys of plain data of a section that are lengths by the types of its fields, and are text with a unit."""
-    for key, field in section.model_fields.items():
-        value = data.get(key)
-        if isinstance(value, dict):
-            for inner in _sections(field.annotation):
-                yield from lengths_with_units(inner, value, f"{path}{key}.")
-        elif any(isinstance(x, str) for x in (value if isinstance(value, list) else [value])) and is_length(
-            field.annotation, field.metadata
-        ):
-            yield f"{path}{key}"
+def numbers_with_units(made: Any, data: Any, key: str) -> Iterator[str]:
+    """The keys within a section's plain data whose text became a number: it had a unit.
+
+    Not those of targets over a size of the case, which say themselves what they need.
+
+    Parameters
+    ----------
+    made
+        What was made of the data: a section, or a list or mapping of sections and values.
+    key
+        That of the data in the case.
+    """
+    if isinstance(made, BaseModel) and isinstance(data, Mapping):
+        for name, field in type(made).model_fields.items():
+            if name in data and not is_over_unit(field.annotation, field.metadata):
+                yield from numbers_with_units(getattr(made, name), data[name], f"{key}.{name}")
+    elif isinstance(made, Mapping) and isinstance(data, Mapping):
+        for name, value in made.items():
+            yield from numbers_with_units(value, data.get(name), f"{key}.{name}")
+    elif isinstance(made, list) and isinstance(data, list):
+        for i, (value, written) in enumerate(zip(made, data, strict=True)):
+            yield from numbers_with_units(value, written, f"{key}.{i}")
+    elif isinstance(made, float) and isinstance(data, str):
+        yield key
 
 
 def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
@@ -183,39 +197,6 @@ def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
     if any(isinstance(each, WithUnit) and each.unit == "metre" for each in metadata):
         return True
     return any(is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
-
-
-def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The section classes within an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in get_args(annotation):
-        yield from _sections(part)
-
-
-NAMES = {
-    "at",
-    "edge",
-    "over",
-    "kind",
-    "then",
-    "control",
-    "errors",
-    "until",
-    "radius",
-    "name",
-    "supports",
-}  # keys with text that is no quantity
-
-
-def texts(part: Any, is_other: Callable[[str], bool] = lambda text: False, path: str = "") -> Iterator[str]:
-    """The keys of plain data whose numbers are text with a unit, without texts `known` to be something else."""
-    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
-        if key in NAMES:
-            continue
-        if isinstance(value, str) and not is_other(value):
-            yield f"{path}{key}"
-        yield from texts(value, is_other, f"{path}{key}.")
 
 
 @dataclass(frozen=True)
@@ -252,18 +233,44 @@ _EXAMPLES = {
 
 
 def _example(unit: str) -> str:
-    return _EXAMPLES.get(unit, f"5 {unit.replace('**', '^')}")
+    over = re.sub(r"^1/(\w+)(?:\*\*(\d))?$", lambda below: f"{below[1]}^-{below[2] or 1}", unit)
+    return _EXAMPLES.get(unit, f"5 {over.replace('**', '^')}")
 
 
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Lengths = Annotated[
     list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)
 ]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 FluxDensity = Annotated[float, _quantity("tesla")]
 Density = Annotated[float, _quantity("kilogram/metre**3")]
+
+
+def _points_somewhere(v: list[float]) -> list[float]:
+    if not any(v):
+        raise ValueError("must not be zero")
+    return v
+
+
+Along = Annotated[Vector, AfterValidator(_points_somewhere)]  # a direction, by a vector of any length
+
+
+class AboutAxis(Section):
+    """A rotation about an axis."""
+
+    axis: Vector
+    """Along it, of any length"""
+    angle: float = Field(ge=-36000, le=36000)
+    """By the right-hand rule [degrees]"""
+
+    @model_validator(mode="after")
+    def _there_is_one(self) -> Self:
+        if not any(self.axis) or not self.angle:
+            raise ValueError("axis and angle must not be zero")
+        return self
 
 
 class Direction(Section):
@@ -419,10 +426,10 @@ def over(unit: Unit) -> OverUnit:
     return OverUnit(convert, json_schema_input_type=float | with_unit(unit.text))
 
 
-def is_over_unit(annotation: Any) -> bool:
+def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
     """Whether a field with this annotation takes text with a unit as a number over a size of the case."""
-    parts = (annotation, *get_args(annotation))
-    return any(isinstance(each, OverUnit) for part in parts for each in getattr(part, "__metadata__", ()))
+    within = (each for part in (annotation, *get_args(annotation)) for each in getattr(part, "__metadata__", ()))
+    return any(isinstance(each, OverUnit) for each in (*metadata, *within))
 
 
 def over_unit(annotation: Any, text: str, shell: Sized) -> float:

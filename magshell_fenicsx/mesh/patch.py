@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from magshell_fenicsx.mesh.given import Home
 
 Embedding = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -170,6 +172,19 @@ class PatchMesh:
 
 class MeshError(ValueError):
     """The triangulation cannot carry a shell; the message says where and why."""
+
+
+def refuse_places(bad: Array, what: str, comm: "MPI.Comm") -> None:
+    """See that no rank has found a bad place (n, 3) over R; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, with the first of them.
+    """
+    if places := [place for of_rank in comm.allgather(bad[:1].tolist()) for place in of_rank]:
+        x, y, z = places[0]
+        raise MeshError(f"{what} at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
 
 
 def place_text(x: NDArray[np.float64]) -> str:

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 import ufl
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.section import Finite, over
+from magshell_fenicsx.input.section import Along, over
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.course import Target
@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry import Leaves, unit
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -46,19 +46,10 @@ class GravityStep(BodyForceStep):
         Quantity("gravity", "gravity", "Weight ρ g R/E of the shell; in SI g.", "load", "ρ g R/E", (ACCELERATION,)),
     )
     kind: Literal["gravity"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: g, or arc length, which passes its folds"""
-    direction: list[Finite] = Field(default=[0.0, 0.0, -1.0], min_length=3, max_length=3)
+    direction: Along = Field(default=[0.0, 0.0, -1.0])
     """Its three components, of any length; by default down e3"""
     acceleration: Annotated[float, over(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
-
-    @field_validator("direction")
-    @classmethod
-    def _points_somewhere(cls, direction: list[float]) -> list[float]:
-        if not any(direction):
-            raise ValueError("must not be zero")
-        return direction
 
     @property
     def place(self) -> Any:
@@ -66,9 +57,8 @@ class GravityStep(BodyForceStep):
 
     @property
     def _along(self) -> NDArray[np.float64]:
-        """The unit vector (3,); the square of 1e-200 would be zero."""
-        large = np.array(self.direction) / max(map(abs, self.direction))
-        return np.asarray(large / np.linalg.norm(large))
+        """The unit vector (3,)."""
+        return unit(np.array(self.direction))
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         return [Leaves(vectors=[self._along])]

@@ -146,8 +146,6 @@ class FoldStep(FactorStep):
         Quantity(AMPLITUDE, "fold", "How far the rest angles of joints have grown to those of the case.", "load"),
     )
     kind: Literal["fold"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of the factor, 1 by default"""
 

@@ -15,7 +15,7 @@ from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_valida
 from magshell_fenicsx.input.section import Section, given, or_number
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.part import Ability, Context
-from magshell_fenicsx.shape.symmetry import Leaves, nothing
+from magshell_fenicsx.shape.symmetry import Leaves, nothing, unit
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.laminate import Laminate
@@ -132,9 +132,7 @@ class LaminateSection(Section):
         """The unit vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
-        vector = np.array([1.0, 0.0, 0.0] if self.along is None else self.along)
-        vector = vector / np.abs(vector).max()  # first: squares of tiny and huge numbers are none
-        return np.asarray(vector / np.linalg.norm(vector))
+        return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))
 
     def refuse_unfit_sizes(self, E: float) -> None:
         """See that moduli are of sizes that numbers can have beside Young's modulus.
@@ -199,17 +197,17 @@ class Laminated(Ability):
 
 
 def _leaves(section: LaminateSection, geometry: str) -> Leaves:
-    unit = section.direction(geometry)
+    along = section.direction(geometry)
     reason = None
     if section.twists:
         reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"
-    elif unit is not None and np.hypot(*unit[:2]) > NONE:
+    elif along is not None and np.hypot(*along[:2]) > NONE:
         reason = "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
 
-    beside = () if unit is None else tuple(float(np.arctan2(unit[1], unit[0])) + turn for turn in (0.0, np.pi / 2))
+    beside = () if along is None else tuple(float(np.arctan2(along[1], along[0])) + turn for turn in (0.0, np.pi / 2))
     if section.twists:
         return Leaves(reason, mirrors=nothing)
-    return Leaves(reason, mirrors=lambda mirror: mirror.keeps_lines(unit), azimuths=beside)
+    return Leaves(reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside)
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:

@@ -285,10 +285,6 @@ class Ability:
         """What abilities may need and a case with this one has not -> what takes it away, and what to do."""
         return {}
 
-    def lengths(self, data: Mapping[str, Any]) -> Iterable[str]:
-        """The keys of its plain data, in that of the case, that are text with a unit of length."""
-        return []
-
     def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
         """Its load that may be a function of time, after steps that have driven amplitudes; None without."""
         return None

@@ -209,11 +209,16 @@ class PathStep(Step):
         return 1.0
 
 
-class BodyForceStep(PathStep):
-    """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
+class LoadStep(PathStep):
+    """The base of loads that the amplitude or the arc length leads to their target: no displacement is prescribed."""
 
     control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the load's amplitude, or arc length, which passes every fold"""
     until: Until = "target"
+
+
+class BodyForceStep(LoadStep):
+    """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if self.target else now.h**2
@@ -222,7 +227,7 @@ class BodyForceStep(PathStep):
         return abs(self.target[1]) or now.h**2 if self.target else now.h**2
 
 
-class FactorStep(PathStep):
+class FactorStep(LoadStep):
     """The base of what grows to a factor, 1 by default.
 
     Where no step drives it, it grows before the one load of a case, up to the first instability at most.
@@ -237,8 +242,6 @@ class FactorStep(PathStep):
 
     section: ClassVar[str]
     label: ClassVar[Literal["", "field"]] = ""
-    control: Literal["load", "arc"] = "arc"
-    until: Until = "target"
     _alone: bool = PrivateAttr(default=False)
 
     @property

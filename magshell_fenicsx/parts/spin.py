@@ -39,8 +39,6 @@ class SpinStep(BodyForceStep):
         Quantity("spin", "spin squared", "Centrifugal load ρ ω² R²/E; in SI ω².", "load", "ρ ω² R²/E", (SQUARED,)),
     )
     kind: Literal["spin"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: ω², or arc length, which passes its folds"""
     speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(default=None, ge=0, le=1e3)
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
 

@@ -54,8 +54,6 @@ class Step(Section):
         The displacement that `hold: conjugate` holds, in words; empty if it cannot be held.
     released
         Why the conjugate cannot be held while the shell moves; empty if it can.
-    measured
-        Whether its numbers have units where the shell's lengths have.
     holdable
         Whether other steps may say what they hold of its amplitude.
     jumps
@@ -72,7 +70,6 @@ class Step(Section):
     amplitude: ClassVar[str]
     conjugate: ClassVar[str] = ""
     released: ClassVar[str] = ""
-    measured: ClassVar[bool] = False
     holdable: ClassVar[bool] = True
     jumps: ClassVar[bool] = True
     in_time: ClassVar[bool] = False

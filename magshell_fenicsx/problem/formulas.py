@@ -52,24 +52,17 @@ class Written:
 
     Attributes
     ----------
+    given
+        Its numbers and formulas, and what they may be.
+    texts
+        The formulas.
     formulas
         Of places over R in the frame of the case, in the case's unit.
-    least, most
-        Allowed values.
-    load
-        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
-        elements of any size. Strains follow all else down to its last detail.
-    deformed
-        Whether it is of the deformed place, where nothing but the points of integration see it.
     """
 
-    key: str
+    given: Formulas
     texts: tuple[str, ...]
     formulas: Together
-    least: float
-    most: float
-    load: bool = False
-    deformed: bool = False
 
     def of_place(self, x: Array) -> Array:
         """Places (n, 3) -> each formula's values (n, formulas)."""
@@ -91,7 +84,7 @@ def _written(context: Context) -> Iterator[Written]:
         texts = tuple(value for value in each.values if isinstance(value, str))
         if texts:
             of_place = Together([formula(text) for text in texts], None, each.length)
-            yield Written(each.key, texts, of_place, each.least, each.most, each.load, each.deformed)
+            yield Written(each, texts, of_place)
 
 
 def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
@@ -104,13 +97,13 @@ def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
     """
     for each in formulas:
         values = each.of_place(x)
-        bad = ~((values >= each.least) & (values <= each.most))
+        bad = ~((values >= each.given.least) & (values <= each.given.most))
         if bad.any():
             row, i = np.argwhere(bad)[0]
             place = ", ".join(f"{c:.3g}" for c in x[row])
-            bounds = f"{each.least:.4g} to {each.most:.4g}"
+            bounds = f"{each.given.least:.4g} to {each.given.most:.4g}"
             raise CaseError(
-                f"{each.key}: {shown(each.texts[i])}: is {values[row, i]:.4g} at (x, y, z)/R = ({place}): "
+                f"{each.given.key}: {shown(each.texts[i])}: is {values[row, i]:.4g} at (x, y, z)/R = ({place}): "
                 f"allowed {bounds}"
             )
 
@@ -272,7 +265,7 @@ def refinements(
 
     finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
     areas = (
-        squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.load])
+        squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.given.load])
         for each, leaves in zip(formulas, narrow, strict=True)
     )
     return [each for each in areas if each]
@@ -322,28 +315,28 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
 
         x, normals, _ = cells.at(element.points)
         turned = replace(each.formulas, frame=Q)
-        bounded = each.key == THICKNESS
+        bounded = each.given.key == THICKNESS
         fit = fitted(values, cells, values(x, normals), element, element.degree, bounded=bounded, formulas=turned)
         missed = fit.rest**2
         if fit.open:
             said.append(
-                f"{each.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its variation may not be "
-                "seen"
+                f"{each.given.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its variation may not "
+                "be seen"
             )
-        wrong = _wrong_stiffness(values, cells, fit.nodal) if each.key == THICKNESS else 0.0
-        lost = max(fit.missed, missed if each.deformed and missed > SQUARE else 0.0)
+        wrong = _wrong_stiffness(values, cells, fit.nodal) if each.given.key == THICKNESS else 0.0
+        lost = max(fit.missed, missed if each.given.deformed and missed > SQUARE else 0.0)
         if lost > TOTAL:
             off = f"{100 * lost:.2g} %"
-            said.append(f"{each.key}: varies so much within elements that its integral may be wrong by {off}")
+            said.append(f"{each.given.key}: varies so much within elements that its integral may be wrong by {off}")
         elif wrong > STIFFNESS:
             said.append(
-                f"{each.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+                f"{each.given.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
                 f"integral is right, but the stiffness may be wrong by {100 * wrong:.2g} %; take a smaller mesh.size "
                 "or a larger mesh.refinement"
             )
-        elif missed > SQUARE and not (each.load and fit.widest < 4 * SHOWN * sqrt(h)):
+        elif missed > SQUARE and not (each.given.load and fit.widest < 4 * SHOWN * sqrt(h)):
             said.append(
-                f"{each.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+                f"{each.given.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
                 f"integral is right, but that of its square lacks {100 * missed:.2g} %; take a smaller mesh.size or a "
                 "larger mesh.refinement"
             )

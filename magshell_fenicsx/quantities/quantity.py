@@ -69,7 +69,8 @@ class Unit:
     size
         What one of the number is in that unit; nan if the case lacks what it needs.
     text
-        The unit into which a text with a unit is converted for it, for pint; empty if no text is.
+        The unit of `size` in pint's words, into which a text with a unit is converted; empty if no text is. A column in
+        another unit than that of a target has a `Unit` of its own.
     needs
         What a case must have for such a text.
     words, symbol

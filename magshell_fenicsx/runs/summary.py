@@ -32,12 +32,11 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
     `time` is from the release until the deflection is half way, in the unit of the column time; `overshoot` the largest
     deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
     """
-    rest = []
-    for i, fold in enumerate(rows[:-1]):
-        if fold["label"] != "fold" or rows[i + 1]["amplitude"] != "time":
+    at_rest = []
+    for i, fold in ((i, row) for i, row in enumerate(rows[:-1]) if row["label"] == "fold"):
+        if rows[i + 1]["amplitude"] != "time":
             continue
-        same = (row for row in rows[i + 1 :] if row["step"] == fold["step"])
-        moving = [fold, *same]
+        moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
             continue
         t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
@@ -46,8 +45,10 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         past_half = scipy.interpolate.CubicSpline(t[:-1], way[:-1] - 0.5)  # the last two rows are of one time
         half = float(scipy.optimize.brentq(past_half, t[at - 1], t[at], xtol=1e-12 * t[at])) - t[0]
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
-        rest.append({**ends, "time": half, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
-    return rest
+        at_rest.append(
+            {**ends, "time": half, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])}
+        )
+    return at_rest
 
 
 @dataclass
@@ -145,7 +146,7 @@ class Result:
         """The located instabilities."""
         return [
             {
-                **self.scene.sizes.values({key: row[key] for key in _told(row)}),
+                **self.scene.sizes.values({key: row[key] for key in _with_units(row)}),
                 "amplitude": row["amplitude"],
                 "value": row[amplitude(str(row["amplitude"])).column],
                 "p_over_pc": row["p_over_pc"],
@@ -289,7 +290,7 @@ def solutions(result: Result) -> list[dict[str, Any]]:
     return entries
 
 
-def _told(row: Row) -> set[str]:
+def _with_units(row: Row) -> set[str]:
     """The columns of a limit point that may have units."""
     return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
 

@@ -14,8 +14,8 @@ from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import (
     OrOfProgram,
     Section,
+    numbers_with_units,
     or_number,
-    texts,
 )
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
@@ -66,14 +66,15 @@ class SurfaceSection(ShellKeys, Material):
         written = {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
         measured = {key: value for key, value in written.items() if isinstance(value, str | int | float)}
         kinds = {isinstance(value, str) for value in measured.values()}
-        profile = data.get("profile") if isinstance(data, dict) else None
-        if len(kinds) > 1 or (kinds == {False} and [*texts(profile)]):
-            bare = [key for key, value in measured.items() if not isinstance(value, str)] or ["a length of profile"]
-            raise ValueError(
-                f"give every length and youngs_modulus a unit, or none of them: {', '.join(bare)} has none"
-            )
+        all_or_none = "give every length and youngs_modulus a unit, or none of them"
+        if len(kinds) > 1:
+            bare = ", ".join(key for key, value in measured.items() if not isinstance(value, str))
+            raise ValueError(f"{all_or_none}: {bare} has none")
         cls.note_sizes(data, handler, info, with_units=kinds == {True})
         section = handler(data)
+        profile = getattr(section, "profile", None)
+        if kinds == {False} and [*numbers_with_units(profile, data.get("profile"), "profile")]:
+            raise ValueError(f"{all_or_none}: {', '.join(measured)} has none")
         modulus = section.youngs_modulus
         if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:
             raise ValueError(

@@ -134,9 +134,12 @@ def tilted(v: Array) -> bool:
 
 
 def unit(v: Array) -> Array:
-    """A vector (3,) over its length; zero stays zero."""
-    size = np.linalg.norm(v)
-    return np.asarray(v / size) if size else v
+    """A vector (3,) over its length; zero stays zero, and what is as short as 1e-200 has a direction."""
+    largest = np.abs(v).max()
+    if not largest:
+        return v
+    large = v / largest
+    return np.asarray(large / np.linalg.norm(large))
 
 
 def of_shape(shell: "ShellSection | Surface", outline: "Outline") -> Leaves:

@@ -26,8 +26,9 @@ from magshell_fenicsx.shells.solid_terms import SolidTerm
 
 Array = NDArray[np.float64]
 PARTS = 4  # value and three reference derivatives
-# numbers that a density wants at a point: in the body X, the inverse of dX/dxi and its determinant; on the outer face
-# X's jet; at ends as in the body with the area in place of the determinant, and n and t
+# where the numbers that a density wants at a point begin: in the body those of X, of the inverse of dX/dxi, and its
+# determinant; at ends the area in its place, then n and t; on the outer face there is X's jet alone
+INVERSE, MEASURE, NORMAL, TANGENT = 3, 12, 13, 16
 SIZES = {"body": 13, "outer": 12, "end": 19}
 
 
@@ -108,19 +109,20 @@ class Site:
         of = density.work or density.of
         self._varying[term.name] = [(target, on_batches(field, self._batches)) for target, field in varying]
 
-        def vector(f: fem.Function, part: int) -> Any:
-            return ufl.as_vector([f[3 * part + c] for c in range(3)])
+        def vector(f: fem.Function, start: int) -> Any:
+            return ufl.as_vector([f[start + c] for c in range(3)])
 
         def second(W: Any) -> Any:
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
         if density.where == "outer":
-            return second(of(*(vector(f, part) for f in (g, z) for part in range(3)), *parameters))
+            return second(of(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters))
         by_reference = ufl.as_matrix([[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)])
-        inverse = ufl.as_matrix([[g[3 + 3 * i + j] for j in range(3)] for i in range(3)])
-        frame = [ufl.as_vector([g[i + c] for c in range(3)]) for i in (13, 16)] if density.where == "end" else []
-        return second(of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters)) * g[12]
+        inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
+        frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.where == "end" else []
+        W = of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters)
+        return second(W) * g[MEASURE]
 
 
 def make_sites(

@@ -18,7 +18,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.connected import CellsOfAll, whole
+from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values, whole_hessian
@@ -75,9 +75,9 @@ class Tee:
     ) -> None:
         V = r0.function_space
         self._comm, element, index = V.mesh.comm, V.element.basix_element, V.dofmap.index_map
+        self._own = 3 * index.local_range[0], 3 * index.size_local
         self.name = self.group = f"joint of {' and '.join(joint.edges)}"
         self._of_all, self._r0, self._u = CellsOfAll.of(V), whole(r0), u
-        self._own = 3 * index.local_range[0], 3 * index.size_local
         self._element = element
         first = self._of_all.own.start
         cells, ends = _sides(V, foot, len(self._of_all.own))
@@ -144,10 +144,7 @@ class Tee:
             g = self._at("gradient", self._r0 + u).reshape(-1, 4, 3)
             forces = forces + np.einsum("nik,nic->nkc", self._D, g)
         np.add.at(residual, self._nodes, factor * forces)
-        if self._comm.size > 1:
-            residual = np.asarray(self._comm.allreduce(residual))
-        start, size = self._own
-        b[:size] += residual.ravel()[start : start + size]
+        add_own(b, residual, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""

@@ -55,7 +55,7 @@ def boundary_map(
     made: Made,
     start: str | None = None,
 ) -> StabilityBoundary:
-    """Follow the instability of a case in one key, for each value of a second one; collective.
+    """Follow the instability of a case in one key, for each value of a second one if there is one; collective.
 
     Parameters
     ----------
@@ -74,6 +74,8 @@ def boundary_map(
     CaseError
         See `boundary`; or if there is an instability at no value of the second key.
     """
+    if len(overs) == 1:
+        return boundary(file, overs[0], settings, out, comm, say, made=made, start=start)
     if start:
         raise CaseError(f"--from {start}: a map starts at the end of each of its cases: give one --over")
     if len(overs) != 2:

@@ -3,13 +3,15 @@
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import pytest
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.section import Section, numbers_with_units, over
 from magshell_fenicsx.parts.kinds import REGISTERED, section_of
+from magshell_fenicsx.quantities.quantity import PRESSURE
+from magshell_fenicsx.shape.ground import Coordinates
 
 PARTS = "magshell_fenicsx.parts"
 
@@ -41,14 +43,31 @@ DIMPLE = {"kind": "dimple", "amplitude": 1.0, "width": 3.0, "at": {"point": ["0 
     [
         ("bodies.a.radius", {}, {"kind": "sphere", "radius": "2 mm"}),
         ("bodies.a.edge", {}, {"kind": "rod", "radius": 0.2, "edge": "1 mm"}),
-        ("bodies.a.size", {}, {"kind": "box", "size": [1, 1, "2 m"], "edge": 0.1, "axis": [1, 0, 0]}),
-        ("bodies.a.position", {}, {"kind": "plane", "position": [0, 0, "2 mm"]}),
-        ("bodies.a.at.point", {}, {"kind": "plane", "at": {"point": [0, 0, "1 m"]}}),
-        ("shell.imperfections.0.at.point", {"imperfections": [DIMPLE]}, None),
-        ("shell.defect.at.point", {"defect": DIMPLE}, None),
+        ("bodies.a.size.2", {}, {"kind": "box", "size": [1, 1, "2 m"], "edge": 0.1, "axis": [1, 0, 0]}),
+        ("bodies.a.position.2", {}, {"kind": "plane", "position": [0, 0, "2 mm"]}),
+        ("bodies.a.at.point.2", {}, {"kind": "plane", "at": {"point": [0, 0, "1 m"]}}),
+        ("shell.imperfections.0.at.point.0", {"imperfections": [DIMPLE]}, None),
+        ("shell.defect.at.point.0", {"defect": DIMPLE}, None),
     ],
 )
 def test_a_unit_beside_a_shell_without_one(key: str, shell: dict[str, Any], body: dict[str, Any] | None) -> None:
     bodies = {"a": body} if body else {}
     with pytest.raises(ValueError, match=rf"{key}: has a unit, but the shell's lengths have none"):
         Case.model_validate({"shell": CAP | shell, "boundary": {"rim": "clamped"}, "bodies": bodies})
+
+
+class Placed(Section):
+    """As a step or a part of its own may be."""
+
+    kind: Literal["placed"]
+    through: list[Coordinates]
+    name: str
+    target: Annotated[float, over(PRESSURE)] | None = None
+
+
+def test_numbers_with_units_are_found_by_what_is_made_of_them() -> None:
+    """Every text that became a number, in any section; not names, and no targets over a size of the case."""
+    data = {"kind": "placed", "through": [[0, "1 mm", 0], [1, 0, 0]], "name": "5 mm", "target": "1 Pa"}
+    made = Placed.model_validate(data, context={"folder": ""})  # no shell: any number will do
+    assert [*numbers_with_units(made, data, "loading.0")] == ["loading.0.through.0.1"]
+    assert [*numbers_with_units({"a": [made]}, {"a": [data]}, "of")] == ["of.a.0.through.0.1"]

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.expressions import Together, together
 from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.given import stored
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.mesh.patch import GivenField, MeshError
+from magshell_fenicsx.mesh.patch import GivenField, MeshError, refuse_places
 from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
 from magshell_fenicsx.models.shell.own_term import ByPlace
 
@@ -373,9 +373,8 @@ def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "m
     MeshError
         On every rank, if a vector is not finite.
     """
-    bad = nodes[~(np.abs(vectors) <= LARGEST).all(axis=-1)][:1].tolist()
-    if said := [place for places in comm.allgather(bad) for place in places]:
-        x, y, z = said[0]
-        raise MeshError(
-            f"{key}: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
-        )
+    refuse_places(
+        nodes[~(np.abs(vectors) <= LARGEST).all(axis=-1)],
+        f"{key}: has no finite value (or one above {LARGEST:g})",
+        comm,
+    )

@@ -11,7 +11,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Together
 from magshell_fenicsx.mesh.assembly import Place
-from magshell_fenicsx.mesh.patch import GivenField, MeshError
+from magshell_fenicsx.mesh.patch import GivenField, MeshError, refuse_places
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.parameters import OwnMaterial
@@ -80,13 +80,11 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
     MeshError
         On every rank, if it is not positive somewhere.
     """
-    bad = x[~((factors >= LEAST_FACTOR) & (factors <= MOST_FACTOR))][:1].tolist()
-    if said := [place for places in comm.allgather(bad) for place in places]:
-        x1, x2, x3 = said[0]
-        raise MeshError(
-            f"shell.thickness_factor: is not within {LEAST_FACTOR:g} to {MOST_FACTOR:g} at (x, y, z)/R = "
-            f"({x1:.3g}, {x2:.3g}, {x3:.3g})"
-        )
+    refuse_places(
+        x[~((factors >= LEAST_FACTOR) & (factors <= MOST_FACTOR))],
+        f"shell.thickness_factor: is not within {LEAST_FACTOR:g} to {MOST_FACTOR:g}",
+        comm,
+    )
 
 
 def thickness_field(

@@ -2,24 +2,25 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from magshell_fenicsx.input.section import Section, lengths_with_units, or_number
+from magshell_fenicsx.input.section import Along, Section, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.shape.ground import At, Coordinates
 from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape.symmetry import unit
 
 Array = NDArray[np.float64]
-Axis = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)]
+Axis = Along
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e9)]
 ALONG = 1e-6  # part of an axis across the approach that counts as none
 
@@ -85,10 +86,9 @@ class PlacedBody:
         CaseError
             If there is none.
         """
-        given = _not_short(axis)
-        v = self.Q @ given
+        v = self.Q @ unit(np.array(axis))
         v = v - (v @ self.direction) * self.direction
-        if (size := float(np.linalg.norm(v))) < ALONG * np.linalg.norm(given):
+        if (size := float(np.linalg.norm(v))) < ALONG:
             raise CaseError(f"{self.key}.axis: is along the approach; give an axis across it")
         return np.asarray(v / size)
 
@@ -150,14 +150,6 @@ class BodySection(Section):
         """
         raise NotImplementedError
 
-    @model_validator(mode="after")
-    def _directions(self) -> Self:
-        for key in ("direction", "axis"):
-            given = getattr(self, key, None)
-            if given is not None and not any(given):
-                raise ValueError(f"{key}: must not be zero")
-        return self
-
 
 def place_body(
     section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float
@@ -172,18 +164,12 @@ def place_body(
         Half the thickness over R.
     """
     out = normal if section.side == "outside" else -normal
-    d = -out if section.direction is None else _not_short(section.direction)
-    d = d / np.linalg.norm(d)
+    d = unit(-out if section.direction is None else np.array(section.direction))
     d, ahead = Q @ d, section.ahead / R
     front = Q @ (place + half * out)
     if section.position is not None:
         front = Q @ (np.array(section.position) / R) + ahead * d
     return PlacedBody(key, front, front - ahead * d, d, Q, R)
-
-
-def _not_short(v: Sequence[float]) -> Array:
-    """Along a vector that is not zero: the square of 1e-200 would be."""
-    return np.array(v, dtype=float) / max(map(abs, v))
 
 
 class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
@@ -201,10 +187,6 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
                 raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
         patch = "of a solid give a force on a patch (kind: indentation, patch)"
         context.needs("bodies", "a mid-surface", hint=patch)
-
-    def lengths(self, data: Mapping[str, Any]) -> Iterator[str]:
-        for name, body in data["bodies"].items():
-            yield from lengths_with_units(type(self.given[name]), body, f"bodies.{name}.")
 
 
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:

@@ -131,7 +131,6 @@ class DeadSection(PathStep):
 
     amplitude: ClassVar[str] = "load"
     conjugate: ClassVar[str] = "displacement along the loads"
-    measured: ClassVar[bool] = True
     in_lengths: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
         "factor": Target("load", "load_factor"),

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.course import Target, Until
+from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 
-class ImperfectionStep(PathStep):
+class ImperfectionStep(LoadStep):
     """An imperfection grows: the factor of its w0, from 0 (the shell without it) to 1 (as given) and beyond.
 
     Displacements are measured from the shape without stress, which grows too; volumes from the shape as drawn.
@@ -27,9 +27,6 @@ class ImperfectionStep(PathStep):
     amplitude: ClassVar[str] = "imperfection"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "imperfection")}
     kind: Literal["imperfection"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
-    until: Until = "target"
     item: int | None = Field(default=None, ge=0)
     """Number of the imperfection in shell.imperfections, from 0; all of them together by default"""
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)

@@ -1,15 +1,15 @@
 """What all imperfections have in common: their sections, sizes with units, and what they bring to a problem."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf, radians, sqrt
-from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
 
-from magshell_fenicsx.input.section import Section, in_units, lengths_with_units, with_unit
+from magshell_fenicsx.input.section import Section, Sized, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.part import Context, KeyAbility
@@ -115,17 +115,6 @@ def in_frame(of_place: Callable[[Array], Values], turn: float) -> Callable[[Arra
     return Turned(of_place, rotation(turn)) if turn else of_place
 
 
-class Shell(Protocol):
-    """A shell with or without units."""
-
-    @property
-    def R_over_h(self) -> float: ...
-    @property
-    def reference(self) -> float: ...
-    @property
-    def poisson_ratio(self) -> float: ...
-
-
 def half_width(width: float, R_over_h: float, nu: float) -> float:
     """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
     return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
@@ -161,7 +150,7 @@ def note_sizes(data: Any, handler: ModelWrapValidatorHandler[Any], info: Validat
         return
     info.context.pop(CONTEXT, None)
     try:
-        shell: Shell = handler({key: value for key, value in data.items() if key not in KEYS})
+        shell: Sized = handler({key: value for key, value in data.items() if key not in KEYS})
     except ValidationError:
         return
     R, R_over_h = shell.reference, shell.R_over_h
@@ -285,23 +274,9 @@ def _refuse_steep(depth: float, slope: float) -> None:
 
 @dataclass(frozen=True)
 class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
-    """All imperfections of a case, by their keys below `shell`.
-
-    Attributes
-    ----------
-    written
-        The sections that stand there, by key; one may be several imperfections.
-    """
+    """All imperfections of a case, by their keys below `shell`."""
 
     key = "imperfections"
-    written: Mapping[str, ImperfectionSection]
-
-    @classmethod
-    def of(cls, context: Context) -> Self | None:
-        given, shell = context.sections.get(cls.key), context.shell
-        written = {f"imperfections.{i}": section for i, section in enumerate(shell.imperfections)}
-        defect = getattr(shell, "defect", None)
-        return cls(given, written | ({"defect": defect} if defect else {})) if given else None
 
     def refuse_unfit(self, context: Context) -> None:
         """See that the shell can have them."""
@@ -314,12 +289,6 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
             except ValueError as e:
                 raise ValueError(f"shell.{key}: {e}") from None
-
-    def lengths(self, data: Mapping[str, Any]) -> Iterator[str]:
-        items = {f"imperfections.{i}": item for i, item in enumerate(data["shell"].get("imperfections") or [])}
-        items |= {"defect": item} if (item := data["shell"].get("defect")) else {}
-        for key, item in items.items():
-            yield from lengths_with_units(type(self.written[key]), item, f"shell.{key}.")
 
 
 def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:

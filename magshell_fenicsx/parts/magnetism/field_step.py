@@ -36,8 +36,6 @@ class FieldSection(FactorStep):
     label: ClassVar[Literal["", "field"]] = "field"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "lambda_m")}
     kind: Literal["field"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: λ_m, or arc length, which passes its folds"""
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target over the field of `magnetic`; 1 by default, 0 switches the field off"""
 

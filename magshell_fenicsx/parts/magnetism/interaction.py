@@ -52,8 +52,6 @@ class InteractionStep(FactorStep):
         Quantity(AMPLITUDE, "interaction", "Factor of the energy of magnetised parts in each other's field.", "load"),
     )
     kind: Literal["interaction"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
     factor: float | None = Field(default=None, ge=0, le=1e3)
     """Target of the factor; 1 by default, 0 switches the interaction off"""
 

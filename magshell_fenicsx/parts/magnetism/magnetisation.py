@@ -1,12 +1,13 @@
 """The field section in the model's frame."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import sqrt
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.expressions import ByFormula, formula, function
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
@@ -23,18 +24,18 @@ from magshell_fenicsx.models.shell.patterns import (
 )
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sensors import sensors, units
-from magshell_fenicsx.parts.magnetism.softness import soft, soft_mirrored
+from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, nothing, tilted
+from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, mirrors_formula, nothing, tilted
 from magshell_fenicsx.shape.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
@@ -100,6 +101,33 @@ def magnetisation(
         own if np.isfinite(own) else 1.0,
         context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
     )
+
+
+def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | None:
+    """What is soft, in a frame turned about e3 (rad); None without a susceptibility; `within` is of `Problem`."""
+    magnetic = context.of(MagneticSection)
+    if magnetic is None or magnetic.susceptibility is None:
+        return None
+    chi, E, remanent = magnetic.susceptibility, context.shell.youngs_modulus, magnetic.remanent
+    patches = dict[str, Array]()
+    pattern: float | Pattern = float(chi) if isinstance(chi, float | int) else 0.0
+    if isinstance(chi, str):
+        pattern = ByFormula([function(chi)], rotation(turn), 1.0)
+    elif isinstance(chi, dict) and isinstance(context.shell, MeshSurface):
+        patches = {name: np.array([each]) for name, each in chi.items()}
+    elif isinstance(chi, dict):
+        rest = np.array([chi.get("rest", 0.0)])
+        rims = tuple((inside, np.array([chi[name]]) if name in chi else rest) for name, inside in within.items())
+        pattern = WithinRims(rims, rest) if rims else float(rest[0])
+    scale = sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
+    tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
+    largest = None if magnetic.saturation is None else magnetic.saturation / tesla
+    return Soft(pattern, scale, tesla, remanent is None, patches or None, largest)
+
+
+def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
+    """Whether a plane mirrors a susceptibility; patches are mapped onto themselves."""
+    return not isinstance(chi, str) or mirrors_formula(chi, mirror, outline.sample())
 
 
 def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:

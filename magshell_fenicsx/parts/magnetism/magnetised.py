@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
@@ -16,6 +18,7 @@ from magshell_fenicsx.parts.magnetism.soft import Soft
 ACROSS = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 RemanenceLaw = Literal["deformation", "rotation"]
+PLACES = 50  # on each rank, where a field and its images are compared
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,13 @@ class Magnetisation:
         if self.gradient is None:
             return np.broadcast_to(uniform, r.shape)
         return np.asarray(uniform + along * r @ self.gradient.T)
+
+    def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
+        """1 if the mirror images of the applied field continue it, -1 if their opposites do; collective."""
+        x = r0.x.array.reshape(-1, 3)
+        x = x[:: len(x) // PLACES + 1]
+        images = self.at(mu, mirror.image(x)) @ mirror.reflection
+        return float(np.sign(r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.at(mu, x))))))
 
     def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
         """With patterns in place of what is given by named patches of a mesh with so many cells on this rank.

@@ -16,7 +16,6 @@ from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
-from magshell_fenicsx.parts.magnetism.softness import parity
 from magshell_fenicsx.parts.seen import Sight
 
 Array = NDArray[np.float64]
@@ -248,8 +247,8 @@ class OwnField:
         """1 if the mirror images of what is magnetised continue it, -1 if their opposites do."""
         sign = self._sign
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
-            state = State(np.zeros(0), {**dict(mu), "lambda_m": mu.get("lambda_m", 0.0) or 1.0})
-            return parity(self._sight, self._sight.loads.magnetic, state, self._sight.mirror)
+            shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
+            return self._sight.loads.magnetic.sign_of_images(shown, self._sight.model.r0, self._sight.mirror)
         return sign
 
     def _parity(self, pattern: Callable[[Array, Array], Array]) -> float:

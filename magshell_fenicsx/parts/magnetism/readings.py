@@ -68,8 +68,6 @@ class SoftSeen(Seen):
         return INDUCED if loads.magnetic and loads.magnetic.soft else ()
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        from magshell_fenicsx.parts.magnetism.softness import parity
-
         field = sight.loads.magnetic
         if field is None or field.soft is None:
             return {}
@@ -78,7 +76,8 @@ class SoftSeen(Seen):
         if 1 not in sight.model.axes:  # of a meridian, with which they turn
             J[:2] = 0.0
         if sight.mirror:
-            J = sight.mirror.summed(J, parity(sight, field, state, sight.mirror)) / sight.mirror.copies
+            sign = field.sign_of_images(state.mu, sight.model.r0, sight.mirror)
+            J = sight.mirror.summed(J, sign) / sight.mirror.copies
         return dict(zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True))
 
 

@@ -1,18 +1,18 @@
 """A source of the applied field as a load: its place, its angle or its strength changes."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Finite, Lengths, Name, Section
-from magshell_fenicsx.parts.course import Now, Target, Until
+from magshell_fenicsx.input.section import AboutAxis, Lengths, Name
+from magshell_fenicsx.parts.course import Now, Target
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.path_step import Count, PathStep
+from magshell_fenicsx.parts.path_step import Count, LoadStep
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, TURN, WAY, WORK, Quantity
@@ -24,22 +24,11 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 
-class SpinSection(Section):
+class SpinSection(AboutAxis):
     """A rotation of a source about an axis through its position, wherever that is."""
 
-    axis: Annotated[list[Finite], Field(min_length=3, max_length=3)]
-    """Along it, of any length"""
-    angle: float = Field(ge=-36000, le=36000)
-    """By the right-hand rule [degrees]"""
 
-    @model_validator(mode="after")
-    def _there_is_one(self) -> Self:
-        if not any(self.axis) or not self.angle:
-            raise ValueError("axis and angle must not be zero")
-        return self
-
-
-class SourceStep(PathStep):
+class SourceStep(LoadStep):
     """A source moves, turns or becomes stronger, in proportion to a factor.
 
     Its conjugate is the force of the shell on the source along the motion, the torque about the axis, or, of the
@@ -62,9 +51,6 @@ class SourceStep(PathStep):
     """Rotation for a factor of one"""
     strength: float | None = Field(default=None, ge=-1e6, le=1e6)
     """Factor of the field for a factor of one, from 1"""
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the factor, or arc length, which passes every fold"""
-    until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e9, le=1e9)
     """Target of the factor, 1 by default"""
     points: Count = 10

@@ -9,9 +9,9 @@ from pydantic import BeforeValidator, Field, model_validator
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, Section, in_units
 from magshell_fenicsx.mesh.patch import GivenField
-from magshell_fenicsx.parts.course import Target, Until
+from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled, Offer
-from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -123,10 +123,6 @@ class NaturalSection(Section, Ability):
         """A stretch makes a shell larger than it was drawn, without stress."""
         return {} if self.stretch is None else {"the area as drawn": "leave out natural.stretch"}
 
-    def lengths(self, data: Mapping[str, Any]) -> list[str]:
-        """Curvatures are over a length."""
-        return measured(data.get("natural"))
-
     def patches(self) -> dict[str, Iterable[str]]:
         values = {f"natural.{key}": getattr(self, key) for key in ("curvature", "stretch")}
         return {key: value for key, value in values.items() if isinstance(value, dict)}
@@ -156,17 +152,7 @@ def components(value: Any) -> list[float | str]:
     return value if isinstance(value, list) else [value] if isinstance(value, float | int | str) else []
 
 
-def measured(data: Any) -> list[str]:
-    """The keys of plain data whose curvature has a unit."""
-
-    def units(value: Any) -> bool:
-        values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
-        return any(units(v) if isinstance(v, list) else per_length(v) is not v for v in values)
-
-    return ["natural.curvature"] if isinstance(data, dict) and units(data.get("curvature")) else []
-
-
-class GrowthSection(PathStep):
+class GrowthSection(LoadStep):
     """The natural shape grows from the drawn one: the factor of `natural.curvature`, or of `natural.stretch` less one.
 
     `until: target` ends at a factor, the others need `grows`.
@@ -177,9 +163,6 @@ class GrowthSection(PathStep):
         "stretch": Target("load", "natural_stretch"),
     }
     kind: Literal["natural"]
-    control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
-    until: Until = "target"
     grows: Literal["curvature", "stretch"] | None = None
     """What grows, where no target says it"""
     curvature: float | None = Field(default=None, ge=-1e3, le=1e3)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.input.section import Finite, Lengths, Name, Section, or_number
+from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
@@ -25,21 +25,11 @@ Array = NDArray[np.float64]
 UNHELD = ("free", "symmetry")
 
 
-class TurnSection(Section):
+class TurnSection(AboutAxis):
     """A rotation about an axis through a point."""
 
-    axis: Annotated[list[Finite], Field(min_length=3, max_length=3)]
-    """Along it, of any length"""
-    angle: float = Field(ge=-36000, le=36000)
-    """By the right-hand rule [degrees]"""
     point: Lengths
     """On the axis, where the shell is undeformed [the shell's length; over R if that has no unit]"""
-
-    @model_validator(mode="after")
-    def _there_is_one(self) -> Self:
-        if not any(self.axis) or not self.angle:
-            raise ValueError("axis and angle must not be zero")
-        return self
 
 
 class MoveSection(Section):
@@ -73,7 +63,6 @@ class EdgeSection(PathStep):
 
     conjugate: ClassVar[str] = "reaction"
     released: ClassVar[str] = "a support that is free to move has a mass, which is not known"
-    measured: ClassVar[bool] = True
     jumps: ClassVar[bool] = False
     conjugate_control: ClassVar[str] = "reaction"
     targets: ClassVar[dict[str, Target]] = {

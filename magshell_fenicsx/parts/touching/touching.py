@@ -20,6 +20,7 @@ import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.nearest import (
@@ -145,10 +146,7 @@ class Touching:
             share = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
             forces = -share[:, None, None] * beta[:, :, None] * n[:, None, :]
             np.add.at(whole, nodes, forces)
-        if self._comm.size > 1:
-            whole = np.asarray(self._comm.allreduce(whole))
-        start, size = self._own
-        b[:size] += whole.ravel()[start : start + size]
+        add_own(b, whole, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""

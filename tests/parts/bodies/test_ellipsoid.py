@@ -110,11 +110,11 @@ def test_place_and_symmetry() -> None:
 
 
 def test_mistakes() -> None:
-    """Its lengths are found by their types: a unit beside a shell without one is refused."""
+    """A unit beside a shell without one is refused."""
     with pytest.raises(CaseError, match="axis: is along the approach"):
         make_problem(case(axis=[0, 0, 1]))
     for key in ("position", "semi_axes"):
-        with pytest.raises(ValueError, match=f"bodies.egg.{key}: has a unit, but the shell's lengths have none"):
+        with pytest.raises(ValueError, match=f"bodies.egg.{key}.0: has a unit, but the shell's lengths have none"):
             case(**{key: ["1 mm", "2 mm", "30 mm"]})
 
 
