@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.input.source import CaseError
+    from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.models.shell import kinematics
     from magshell_fenicsx.models.shell.kinematics import Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
@@ -55,6 +56,7 @@ __all__ = [
     "Held",
     "Hinged",
     "Jet",
+    "MeshError",
     "OnPlane",
     "OwnTerm",
     "Pressure",
@@ -89,6 +91,7 @@ __all__ = [
 _ROOMS = {
     "case.case": "Case",
     "input.source": "CaseError",
+    "mesh.patch": "MeshError",
     "models.shell": "kinematics",
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",

@@ -249,7 +249,7 @@ def ensemble(
         typer.Option(metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"),
     ] = None,
     out: Annotated[str | None, folder_option("results/<case name>_ensemble/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted ensemble in that folder")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="refuse a folder without samples of this ensemble")] = False,
 ) -> None:
     """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -284,7 +284,7 @@ def design(
     case: CaseFile,
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_design/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="refuse a folder without evaluations of a design")] = False,
 ) -> None:
     """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
     from magshell_fenicsx.output.store.folder import DiskError

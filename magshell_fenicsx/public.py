@@ -13,6 +13,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.runs.gradients import gradients_after
+from magshell_fenicsx.runs.modes import frequencies_after
 from magshell_fenicsx.runs.running import run as run_problem
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import follow as follow_scene
@@ -186,9 +188,11 @@ def run(
 
     Raises
     ------
-    CaseError
-        If no problem or no model can be built, `out` cannot be written, has files that no run has written, a run of
-        another case file or an interrupted one, or no run of this case to resume; what is in `out` stays as it is.
+    CaseError, MeshError
+        If no problem or no model can be built: a MeshError, where the surface has no such edge or patch, or its
+        triangulation carries no shell. A CaseError too, if `out` cannot be written, has files that no run has written,
+        a run of another case file or an interrupted one, or no run of this case to resume; what is in `out` stays as
+        it is.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError
@@ -196,7 +200,7 @@ def run(
     """
     comm = processes(case, comm)
     problem = problem_of(case, comm, terms)
-    return run_problem(
+    result = run_problem(
         problem,
         out,
         comm,
@@ -207,3 +211,8 @@ def run(
         time_limit=time_limit,
         pictures=pictures,
     )
+    if out is None:  # with a folder they are there already
+        on_first: Say = say if comm.rank == 0 else lambda line: None
+        frequencies_after(result, None, on_first)
+        gradients_after(result, None, on_first)
+    return result

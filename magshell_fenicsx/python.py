@@ -155,7 +155,10 @@ class Piece:
 
 
 def Section(key: str, **keys: Any) -> Piece:
-    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, `Section("natural", ...)`."""
+    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, `Section("natural", ...)`.
+
+    One that is a list is a keyword of `Problem`: `joints=[...]`, `contact=[...]`.
+    """
     return Piece(key, lambda shell: shell.plain(keys, key))
 
 

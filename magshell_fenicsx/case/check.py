@@ -66,6 +66,8 @@ def _described(case: Case, problem: Problem) -> str:
         left_out.append(no_potential(open_at))
     if case.ensemble:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
+    if case.design:
+        left_out.append("design: what varies (magshell design alone varies it)")
     if case.identify:
         left_out.append("identify: numbers that are looked for (magshell identify alone varies them)")
     left_out = left_out or ["nothing"]

@@ -192,12 +192,15 @@ class Several:
     @property
     def told(self) -> list[str]:
         """What `check` says of the scales."""
-        lines = [f"scales: R, h, E, nu and the density are those of the shell {self.parts[0].name}"]
+        has_density = self.parts[0].case.shell.density is not None
+        scales = "R, h, E, nu and the density" if has_density else "R, h, E and nu"
+        lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
         words = self.assembly.laws
         for part in self.parts[1:]:
             said = f"h {self.ratio(part):.4g} times" + ("" if part.case.thickness_factor is None else " its factor")
             if own := (self.materials or {}).get(part.name):
-                said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}, density {own.density:.4g} times"
+                said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}"
+                said += f", density {own.density:.4g} times" if has_density else ""
             said += f", law: {words[part.name]}" if len({*words.values()}) > 1 else ""
             lines.append(f"  {part.name}: {said}")
         return lines

@@ -21,8 +21,8 @@ Until = Annotated[
         description="Where the path ends. limit: at the first instability. Where that is a mode which a half or a "
         "meridian excludes, the path goes on to the model's own first one, but not beyond twice the load; the result "
         "is still the first. bifurcation: at the first bifurcation; folds are passed. target: at the target. points: "
-        "after `points` steps by arc length. zero: where the load has risen and fallen back to zero, the top of an "
-        "energy barrier, whose height is `barrier` in summary.json"
+        "after `points` steps by arc length. zero, with control: arc: where the load has risen and fallen back to "
+        "zero, the top of an energy barrier, whose height is `barrier` in summary.json"
     ),
 ]
 Prescribed = Literal["load", "conjugate"]

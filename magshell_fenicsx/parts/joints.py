@@ -36,8 +36,8 @@ class JointSection(Section):
     """Two edges that meet, or an edge and the shell on which it is, joined."""
 
     edges: Annotated[list[str], Field(min_length=2, max_length=2)]
-    """Both, each with the name of its shell: [upper.rim, lower.rim]; of a T-junction the edge, then the shell on whose
-    mid-surface it is: [stiffener.foot, plate]"""
+    """Both, each with the name of its shell, as [upper.rim, lower.rim]; of a T-junction, as [stiffener.foot, plate],
+    the edge, then the shell on whose mid-surface it is"""
     kind: Literal["rigid", "hinge", "spring"] = "rigid"
     """The angle between the shells stays, is free, or has a spring"""
     stiffness: Annotated[float, or_number("newton"), Field(ge=0, le=1e30)] | None = None

@@ -49,8 +49,8 @@ def refuse_unknown(scene: Scene) -> None:
     refuse_unknown_parameters(scene.problem.context, section.by, start)
 
 
-def gradients_after(result: Result, folder: Path, say: Say) -> None:
-    """Write fields/gradients_*.vtu and keep the numbers; collective.
+def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
+    """Keep the numbers, and with a folder write fields/gradients_*.vtu; collective.
 
     Raises
     ------
@@ -74,7 +74,8 @@ def gradients_after(result: Result, folder: Path, say: Say) -> None:
             drawn = _surface(scene, adjoint, fields)
             for by, most in scene.comm.bcast(drawn and {by: _most(drawn, by) for by in fields}).items():
                 told[by] |= most
-            by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
+            if folder:
+                by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
         result.gradients[of] = {"value": adjoint.shown, "kind": kind, "numbers": numbers, "fields": told}
         for by, v in told.items():
             alike, place = _words(v["alike"], v["most_per_area"], 6), _words(v["at"], 1.0, 3)

@@ -183,8 +183,8 @@ def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
     )
 
 
-def frequencies_after(result: Result, folder: Path, say: Say) -> None:
-    """Write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last of the points; keep the modes.
+def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
+    """Keep the modes; with a folder write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last point.
 
     Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
 
@@ -232,6 +232,8 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         in_hertz = "" if f is None else f", {f:.6g} Hz"
         of_mode = f", m = {wave}" if wave.isdigit() else wave and f", {wave}"
         say(f"{free}lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}")
+    if folder is None:
+        return
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):

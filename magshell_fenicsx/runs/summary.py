@@ -81,7 +81,7 @@ class Result:
     kept
         States at the points whose frequencies are requested, by row number; not of the start and the end.
     frequencies
-        The natural modes, by row number.
+        The natural modes, by row number; their `eigenvalue` is omega^2 rho R^2/E.
     contact_changes
         Beside bodies how much their omega^2 depend on the bodies' stiffness; see `frequencies.contact_changes`.
     found

@@ -378,7 +378,8 @@ def _followed(
         part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
         beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
-        say(f"{span.key} = {span.text(row['key'])}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
+        at = f"{row['key']:.9g} {span.unit}".rstrip()
+        say(f"{span.key} = {at}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
 
     try:
         start = curve.start(value, *varied.start())

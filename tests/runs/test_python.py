@@ -107,3 +107,21 @@ def test_no_display_and_no_virtual_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(RuntimeError, match="no Xvfb to make one"):
         ms.off_screen()
+
+
+def test_frequencies_and_gradients_need_no_folder() -> None:
+    """A clamped disc rings at 10.2158 sqrt(D/(rho h R^4)) (Leissa); its bending stiffness is that of h^3."""
+    case = {
+        "shell": {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.3},
+        "boundary": {"rim": "clamped"},
+        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-9, "points": 1},
+        "frequencies": {"count": 1, "at": "ends"},
+        "gradients": {"of": ["w_pole_over_h"], "by": ["shell.radius_to_thickness", "thickness"]},
+    }
+    result = ms.run(case)
+    D = result.scene.problem.material.bending_stiffness
+    found = [float(np.sqrt(modes[0].eigenvalue / D)) for modes in result.frequencies.values()]
+    assert sorted(result.frequencies) == [0, result.end]
+    assert found == pytest.approx([10.2158, 10.2158], rel=1e-4)
+    gradient = result.gradients["w_pole_over_h"]
+    assert gradient["fields"]["thickness"]["alike"][0] == pytest.approx(-3 * gradient["value"], rel=1e-4)

@@ -79,8 +79,8 @@ class TimeSection(Step):
     push: PushSection | None = None
     """How it begins to move"""
     velocity: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
-    """Initial velocity, added: formulas of the undeformed place x, y, z [length of the shell; over R if without unit]
-    along e1, e2, e3 [the same per unit of time]"""
+    """Initial velocity along e1, e2, e3, added: formulas of the undeformed place x, y, z in the length of the shell,
+    over R if that has no unit [the same length per unit of time]"""
     until: Literal["duration", "rest", "event", "instability"] = "duration"
     """At the end of the duration; as soon as the shell rests: then its equilibrium is the last row; at the `event`; or
     at the first row at which the shell has an unstable direction"""

@@ -41,7 +41,7 @@ class MoveSection(Section):
     supports: list[str] = Field(min_length=1, max_length=1000)
     """Names of `boundary` that hold displacements: edges, points or patches"""
     translation: Lengths | None = None
-    """[the shell's length; over R if that has no unit]"""
+    """For a factor of one [the shell's length; over R if that has no unit]"""
     rotation: TurnSection | None = None
     """About a fixed axis"""
 
