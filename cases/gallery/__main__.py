@@ -17,7 +17,8 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
-WIDTH = 420  # of a picture: 10 to 90 kB
+WIDTH = 420  # pixels of a picture: 10 to 90 kB
+COLUMN = 4.8  # inches
 FIRST = (
     "identify.png",
     "designed.png",
@@ -104,9 +105,10 @@ def _add_shapes(folder: Path) -> None:
 
 
 def _shrink(source: Path, target: Path) -> None:
-    picture = Image.open(source).convert("RGB")
-    wide = WIDTH * (2 if picture.width > 1.5 * picture.height else 1)
-    picture.thumbnail((wide, 10 * WIDTH))
+    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters stay legible."""
+    with Image.open(source) as opened:
+        wide, picture = opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN, opened.convert("RGB")
+    picture.thumbnail((WIDTH * (2 if wide else 1), 10 * WIDTH))
     picture.save(target, optimize=True)
 
 
