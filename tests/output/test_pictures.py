@@ -146,7 +146,7 @@ def plain() -> Coloured:
 def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
     """Two squares that move up and to the right: the outline is dashed only where they are not; crumbs are left out."""
     before = two_squares()
-    after = replace(before, u=before.u + [0.7, 0.0, 0.5])
+    after = replace(before, u=np.add(before.u, (0.7, 0.0, 0.5)))
     panel = Background(after, Camera(ABOVE), 300).panel(plain(), STYLE)
     x, _ = np.concatenate([line for line, (_, dashes) in panel.lines if dashes == "--"]).T
     assert np.nanmin(x) == pytest.approx(-1, abs=0.02)

@@ -20,7 +20,7 @@ from magshell_fenicsx.output.pictures.colours import (
     strains,
     stretches,
 )
-from magshell_fenicsx.output.pictures.layout import Arrow, Panel, Pen, columns, drawing, panel_width, panels_figure
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel, columns, drawing, panel_width, panels_figure
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
 from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window, tessellated
 from magshell_fenicsx.problem.wanted import OutputSection
@@ -170,7 +170,7 @@ class Background:
 
 
 def apart(lines: Sequence[Array], others: Sequence[Array], distance: float, least: float = 0.0) -> list[Array]:
-    """Lines (n, 2) with nan where they are as near as that to others, and where what is left is shorter than `least`."""
+    """Lines (n, 2) with nan where they are as near as that to others, or what is left is shorter than `least`."""
     from scipy.spatial import cKDTree
 
     if not len(others):
@@ -189,7 +189,7 @@ def apart(lines: Sequence[Array], others: Sequence[Array], distance: float, leas
 
 
 def rims(surface: Surface) -> Array:
-    """Places (n, 3) along all edges of a deformed mid-surface, each followed by nan: those that one triangle has alone."""
+    """Places (n, 3) along the edges of a deformed mid-surface, which one triangle has alone; nan follows each."""
     if surface.is_body:
         return np.zeros((0, 3))
     inner = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
