@@ -14,6 +14,7 @@ from PIL import Image
 import magshell_fenicsx.parts.registered  # noqa: F401  # the columns of all parts, by which a path.csv is read
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.output.store.known import case_in
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
@@ -88,7 +89,8 @@ def telling(folder: Path) -> list[str]:
     rows = read_rows(folder / "path.csv")
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
-    if any(row["label"] == "bifurcation" and row["mode"].startswith("m = ") for row in rows[:-1]):
+    steps = case_in(folder)["loading"]
+    if any(step.get("then") == "follow" for step in (steps if isinstance(steps, list) else [steps])):
         return ["shell.png"]
     if any(row["label"] == "bifurcation" for row in rows):
         return ["instabilities.png"]

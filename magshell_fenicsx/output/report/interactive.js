@@ -68,7 +68,7 @@
   const poles = [[0, "#5a85c7"], [0.5, "#5a85c7"], [0.5, "#cc5c54"], [1, "#cc5c54"]];
   const solids = () => about.solids[state.frame].map(s => {
     const r = scaled(s.r), of = array(s.triangles), size = Math.max(...bounds().map(b => b[1] - b[0])), d = about.camera;
-    if (!s.poles.length) for (let i = 0; i < r.length; i++) r[i] += 0.004 * size * d[i % 3] / Math.hypot(...d); // what touches is not drawn in stripes
+    if (!s.poles.length) for (let i = 0; i < r.length; i++) r[i] += 0.008 * size * d[i % 3] / Math.hypot(...d); // what touches is not drawn in stripes
     const drawn = {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0, of), j: corner(1, of), k: corner(2, of),
       flatshading: false, lightposition: lamp, lighting, hovertemplate: `${s.name}<extra></extra>`, showscale: false};
     return s.poles.length ? {...drawn, intensity: s.poles, cmin: -1, cmax: 1, colorscale: poles} : {...drawn, color: "#8a9c9c", opacity: 0.35};
