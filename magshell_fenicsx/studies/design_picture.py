@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.picture import rims
+from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design_blocks import Between
 from magshell_fenicsx.studies.design_variables import Variables
@@ -113,6 +114,8 @@ def _draw_history(
             axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
             axes.set_yscale("log")
+    if axes.get_yscale() == "linear":
+        axes.yaxis.set_major_formatter(number_format())
     shown = unit if unit in {"Hz", *endings().values()} else ""
     several = shown or _common([result_words(result) for result in results])
     axes.set_ylabel(result_words(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
