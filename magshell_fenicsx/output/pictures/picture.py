@@ -36,7 +36,7 @@ UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
 SEEN_APART = (
     2.0  # pixels between the outlines of the undeformed and of the deformed shell; nearer the former is no news
 )
-CRUMB = 12.0  # pixels: what is left of that outline is longer
+CRUMB = 40.0  # pixels: what is left of that outline is longer
 SAME_PLACE = 1e-7  # over R
 DIVISION = 8  # of a line between two nodes
 

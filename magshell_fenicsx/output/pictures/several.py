@@ -155,10 +155,11 @@ def add_shapes(
         taken[number].append(np.array([corner, corner + size]))
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": MARK / 2}
         end = _nearest(axes, image, at, corner, size)
-        axes.annotate("", at, end, textcoords="axes fraction", arrowprops=line, zorder=3)  # type: ignore[arg-type]
+        begin, (x, y) = (float(at[0]), float(at[1])), corner + size / 2
+        axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line, zorder=3)
         shown = OffsetImage(image, zoom=72 / figure.dpi, resample=True)
         how: dict[str, Any] = {"xycoords": "axes fraction", "frameon": False, "pad": 0, "zorder": 3}
-        axes.add_artist(AnnotationBbox(shown, tuple(corner + size / 2), **how))
+        axes.add_artist(AnnotationBbox(shown, (float(x), float(y)), **how))
         if row["label"] not in LOCATED:  # those have marks
             axes.plot(*at, "o", color="k", markersize=MARK, zorder=5)
 
