@@ -14,10 +14,12 @@ from PIL import Image
 import magshell_fenicsx.parts.registered  # noqa: F401  # the columns of all parts, by which a path.csv is read
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.output.store.known import case_in
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"
-WIDTH = 420  # of a picture: 10 to 90 kB
+WIDTH = 420  # pixels of a picture: 10 to 90 kB
+COLUMN = 4.8  # inches
 FIRST = (
     "identify.png",
     "designed.png",
@@ -87,7 +89,8 @@ def telling(folder: Path) -> list[str]:
     rows = read_rows(folder / "path.csv")
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
-    if any(row["label"] == "bifurcation" and row["mode"].startswith("m = ") for row in rows[:-1]):
+    steps = case_in(folder)["loading"]
+    if any(step.get("then") == "follow" for step in (steps if isinstance(steps, list) else [steps])):
         return ["shell.png"]
     if any(row["label"] == "bifurcation" for row in rows):
         return ["instabilities.png"]
@@ -104,9 +107,10 @@ def _add_shapes(folder: Path) -> None:
 
 
 def _shrink(source: Path, target: Path) -> None:
-    picture = Image.open(source).convert("RGB")
-    wide = WIDTH * (2 if picture.width > 1.5 * picture.height else 1)
-    picture.thumbnail((wide, 10 * WIDTH))
+    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters stay legible."""
+    with Image.open(source) as opened:
+        wide, picture = opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN, opened.convert("RGB")
+    picture.thumbnail((WIDTH * (2 if wide else 1), 10 * WIDTH))
     picture.save(target, optimize=True)
 
 

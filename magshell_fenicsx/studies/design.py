@@ -233,7 +233,7 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     by_first(comm, drawn)
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
-    for target in wanted.targets.values():
+    for target in [*wanted.targets.values()] or [None]:
         by_first(comm, partial(_draw_reached, drawn, folder / "verified", target))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):
@@ -241,7 +241,7 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     return content
 
 
-def _draw_reached(drawn: Callable[[Reached | None], None], folder: Path, target: Target) -> None:
+def _draw_reached(drawn: Callable[[Reached | None], None], folder: Path, target: Target | None) -> None:
     drawn(reached_shape(folder, target))
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import read_point
+from magshell_fenicsx.output.pictures.picture import rims
+from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design_blocks import Between
 from magshell_fenicsx.studies.design_variables import Variables
@@ -29,15 +31,19 @@ MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 @dataclass(frozen=True)
 class Reached:
-    """A wanted shape and the one that is reached: places (n, 3) along the middle of the shell."""
+    """The one that is reached, and if there is one the wanted: places (n, 3) along the middle of the shell.
 
-    wanted: Array
+    `edges`: those of the undeformed shell (m, 3), with nan between them.
+    """
+
+    wanted: Array | None
     reached: Array
     undeformed: Array
+    edges: Array
 
 
-def reached_shape(folder: Path, target: Callable[[Array], Array]) -> Reached | None:
-    """What a run's last point has of a wanted shape, along the shell's nodes in the plane y = 0; None without any."""
+def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reached | None:
+    """The shape at a run's last point, along the shell's nodes in the plane y = 0; None without any point."""
     numbers = sorted(int(file.stem.removeprefix("point_")) for file in (folder / "fields").glob("point_*.vtu"))
     if not numbers:
         return None
@@ -45,7 +51,8 @@ def reached_shape(folder: Path, target: Callable[[Array], Array]) -> Reached | N
     off = np.abs(surface.r0[:, 1])
     at = np.flatnonzero(off <= off.min() + IN_PLANE)
     at = at[np.argsort(surface.r0[at, 0], kind="stable")]
-    return Reached(target(surface.r0[at]), (surface.r0 + surface.u)[at], surface.r0[at])
+    wanted, edges = target(surface.r0[at]) if target else None, rims(replace(surface, u=0 * surface.u))
+    return Reached(wanted, (surface.r0 + surface.u)[at], surface.r0[at], edges)
 
 
 def draw_design(
@@ -64,12 +71,12 @@ def draw_design(
     asked
         Result -> the value that is wanted.
     shape
-        The shapes, where one is wanted.
+        The shape that is reached, if it is known.
     """
     from matplotlib.figure import Figure
 
     units = dict.fromkeys(map(_unit, results))
-    panels = 1 + (shape is not None) + (vary.controls is not None) + len(vary.fields)
+    panels = 1 + (shape is not None and shape.wanted is not None) + (vary.controls is not None) + len(vary.fields)
     figure = Figure(figsize=(4.0 * panels, max(3.6, 2.1 * len(units))), dpi=160, layout="constrained")
     grid = figure.add_gridspec(len(units), panels)
     above: Any = None
@@ -80,10 +87,10 @@ def draw_design(
     above.set_xlabel("evaluation (line: the best so far)")
     above.xaxis.get_major_locator().set_params(integer=True)
     others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
-    if shape is not None:
-        _draw_shape(others.pop(0), shape)
+    if shape is not None and shape.wanted is not None:
+        _draw_shape(others.pop(0), shape, shape.wanted)
     if vary.controls and vary.remanence:
-        _draw_remanence(others[0], vary, x)
+        _draw_remanence(others[0], vary, x, shape)
     for axes, field in zip(others[len(others) - len(vary.fields) :], vary.fields, strict=True):
         _draw_field(axes, field, field.values(x[vary.blocks[field.name]]))
     figure.savefig(file)
@@ -107,25 +114,39 @@ def _draw_history(
             axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
             axes.set_yscale("log")
+    if axes.get_yscale() == "linear":
+        axes.yaxis.set_major_formatter(number_format())
     shown = unit if unit in {"Hz", *endings().values()} else ""
-    several = shown or "results"
+    several = shown or _common([result_words(result) for result in results])
     axes.set_ylabel(result_words(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
 
 
-def _draw_shape(axes: Any, shape: Reached) -> None:
+def _common(words: Sequence[str]) -> str:
+    """What results of several points are, before the points' names.
+
+    Examples
+    --------
+    >>> _common(["$f_z$ of east", "$f_z$ of west"]), _common(["mass", "knockdown"])
+    ('$f_z$', 'results')
+    """
+    heads = {word.rpartition(" of ")[0] for word in words}
+    return heads.pop() or "results" if len(heads) == 1 else "results"
+
+
+def _draw_shape(axes: Any, shape: Reached, wanted: Array) -> None:
     """The wanted and the reached shape from the side."""
     axes.plot(*shape.undeformed[:, ::2].T, "--", color="0.6", linewidth=0.8, label="undeformed")
-    axes.plot(*shape.wanted[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
+    axes.plot(*wanted[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
     axes.plot(*shape.reached[:, ::2].T, color="C0", linewidth=1.3, label="reached")
     axes.set(xlabel="$x/R$", ylabel="$z/R$", title="along the middle, $y = 0$")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8)
 
 
-def _draw_remanence(axes: Any, vary: Variables, x: Array) -> None:
-    """The vectors at their places on the undeformed shell, with room for the longest."""
+def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: Reached | None) -> None:
+    """The vectors at their places on the undeformed shell and its edges, with room for the longest."""
     assert vary.controls
     places, vectors = vary.controls.places, vary.vectors(x)
     names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
@@ -135,6 +156,8 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array) -> None:
     across, up = places[:, first], places[:, second]
     joined = "-" if vary.controls.around or not places[:, 1:].any() else ""
     axes.plot(across, up, joined + ".", color="0.6", markersize=3, linewidth=1)
+    if shape is not None and not vary.controls.around:
+        axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
     size = ARROW * float(np.ptp(places, axis=0).max()) / longest
     right, above = size * vectors[:, first], size * vectors[:, second]

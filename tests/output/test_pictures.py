@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.colours import loads, moments, strains
+from magshell_fenicsx.output.pictures.colours import Coloured, loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png, written
-from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, figures, spread
+from magshell_fenicsx.output.pictures.picture import PICTURES, Background, apart, drawn_arrows, figures, rims, spread
 from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
 from magshell_fenicsx.output.pictures.view import (
     LAMP,
@@ -110,15 +110,56 @@ def test_a_plate_has_the_colours_of_its_bar() -> None:
     assert image[inside][:, :3].min() >= 253  # but for what is lost where it is seen aslant
 
 
-def test_what_is_in_front_hides_what_is_behind() -> None:
-    """Two squares, one above the other, and linear values between nodes, as an independent formula has them."""
+def test_no_light_makes_one_colour_of_another() -> None:
+    """A tenth of a red limit on the slope that is lit best: the colour of the bar, where it once was white."""
+    colours = colour_map(SIGNED, (0.0, 1.0))
+    image = seen(slopes(0.5)).coloured(np.full(8, 0.1), (0.0, 1.0), colours)
+    assert image[150, 75, :3] == pytest.approx(255 * np.array(colours(0.1)[:3]), abs=2.5)
+    bright = seen(slopes(0.5)).coloured(np.full(8, 0.9), (0.0, 1.0), colours)[150, 75, :3]
+    assert bright / bright.max() == pytest.approx(np.array(colours(0.9)[:3]) / max(colours(0.9)[:3]), abs=0.02)
+
+
+def two_squares() -> Surface:
+    """One above the other, the upper one half as wide."""
     low, high = plate(0.0), plate(-0.5)  # -w is up
     half = replace(high, r0=high.r0 * [0.5, 0.5, 1.0])
-    both = Surface(
-        *(np.concatenate([getattr(low, name), getattr(half, name)]) for name in ("r0", "u", "n0")),
-        np.concatenate([low.cells, low.cells + 4]),
-        {},
-    )
+    joined = (np.concatenate([getattr(low, name), getattr(half, name)]) for name in ("r0", "u", "n0"))
+    return Surface(*joined, np.concatenate([low.cells, low.cells + 4]), {})
+
+
+def test_edges_are_drawn_in_front_of_the_shell_itself() -> None:
+    """Those of one triangle alone: no diagonal, no ridge with double nodes; the rim of the upper of two squares."""
+    edges = rims(plate(0.0)).reshape(4, -1, 3)[:, :-1]
+    assert (np.abs(edges[..., :2]).max(axis=-1) == 1).all()
+    on_ridge = np.abs(rims(slopes(0.5))[:, 0]) < 1e-9
+    assert on_ridge.sum() == 4  # the ends of the other edges
+    panel = Background(two_squares(), Camera(ABOVE), 300).panel(plain(), STYLE)
+    x, y = np.concatenate([line for line, _ in panel.lines]).T
+    assert (np.abs(y[np.abs(x - 0.5) < 1e-6]) <= 0.6).sum() > 10
+
+
+def plain() -> Coloured:
+    """No colours."""
+    return Coloured("", np.zeros(8), (0.0, 1.0), "", "")
+
+
+def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
+    """Two squares that move up and to the right: the outline is dashed only where they are not; crumbs are left out."""
+    before = two_squares()
+    after = replace(before, u=np.add(before.u, (0.7, 0.0, 0.5)))
+    panel = Background(after, Camera(ABOVE), 300).panel(plain(), STYLE)
+    x, _ = np.concatenate([line for line, (_, dashes) in panel.lines if dashes == "--"]).T
+    assert np.nanmin(x) == pytest.approx(-1, abs=0.02)
+    assert np.nanmax(x) < -0.25
+    line = np.column_stack([np.linspace(0, 1, 101), np.zeros(101)])
+    (left,) = apart([line], [np.array([[0.2, 0.0], [0.25, 0.0]])], 0.04, 0.1)
+    assert np.nanmin(left[:, 0]) < 0.01
+    assert apart([line[:5]], [np.array([[9.0, 0.0]])], 0.04, 0.1) == []
+
+
+def test_what_is_in_front_hides_what_is_behind() -> None:
+    """Two squares, one above the other, and linear values between nodes, as an independent formula has them."""
+    both = two_squares()
     view = seen(both)
     image = view.coloured(np.array([0.0, 1, 1, 0, 1, 1, 1, 1]), (0.0, 1.0), colour_map("gray"))
     assert (image[150, 150, :3] == 255).all()  # the upper one

@@ -184,11 +184,11 @@ def _lay(image: Image, under: NDArray[np.uint8]) -> None:
     """Put an image with transparency on a part of a frame."""
     part = image[..., 3:] / 255
     laid = part * image[..., :3] + (1 - part) * under
-    edge = RIM * _edge(part)
+    edge = RIM * edge_of(part)
     under[:] = np.rint((1 - edge) * laid + edge * 255 * GREY)
 
 
-def _edge(part: Array) -> Array:
+def edge_of(part: Array) -> Array:
     """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at its rim."""
     least = part.copy()
     for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):

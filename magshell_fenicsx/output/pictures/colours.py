@@ -59,6 +59,7 @@ NOISE = 20.0  # colour limit over the difference between fields of cells and the
 NONE = 0.01  # of the larger of two fields: what is smaller is zero
 UNRESOLVED, SLIGHT = 0.05, 0.02  # differences between cells, and strains over those of bending, that are not drawn
 DETAIL, AROUND = 0.15, 2.0  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
+FEW = 12  # cells that carry a pressure whose distribution is not resolved
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 
 
@@ -228,8 +229,14 @@ def contact(surface: Surface) -> list[Coloured]:
     most = float(pressure.max()) or 1.0
     return [
         Coloured("gap_over_h", gap, (0.0, 1.0), NEAR, "gap$/h$"),
-        Coloured("contact_pressure", pressure, (0.0, most), "Reds", r"contact pressure $pR/(Eh)$"),
+        Coloured("contact_pressure", pressure, (0.0, most), SIGNED, r"contact pressure $pR/(Eh)$"),
     ]
+
+
+def few_cells_said(surface: Surface) -> str:
+    """That the drawn pressure is no distribution, where few cells carry it: in each it is a mean."""
+    number = int((surface.fields["contact_pressure"][surface.cells] > 0).all(axis=1).sum())
+    return f"The pressure is a mean over each cell; {number} carry it." if 0 < number < FEW else ""
 
 
 def contact_region(surface: Surface) -> Array | None:

@@ -25,6 +25,7 @@ GAP = 4.0  # mm between panels
 HEAD = 0.012  # around the ends of arrows, over a panel's width
 LONG = 0.08  # an arrow of this length over a panel's width has the full thickness
 LINE = 1.45 / 72  # height of a line of text in inches, for each point of the font
+LETTER = 0.6  # room of a letter beside the directions
 LEVEL = 3  # files are a quarter larger than by default and take a third of the time
 
 
@@ -221,6 +222,7 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
     axes.set_axis_off()
     on_screen = axes_on_screen(camera.direction)
     arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, "lw": 0.7, "mutation_scale": style.font_size * 0.8}
+    written = list[Array]()
     for number, (x, y) in enumerate(zip(*(0.9 * on_screen).T, strict=True), 1):
         size = float(np.hypot(x, y))
         if size < 0.05:  # it points to the eye, or away
@@ -228,8 +230,16 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
             x, y, size = -0.35, -0.35, 0.5
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
-        further = 1 + 0.4 / size
-        axes.text(further * x, further * y, f"$e_{number}$", ha="center", va="center")
+        written.append(_beside(np.array([x, y]), size, written))
+        axes.text(*written[-1], f"$e_{number}$", ha="center", va="center")
+
+
+def _beside(end: Array, size: float, others: Sequence[Array]) -> Array:
+    """Where the letter of an arrow stands: ahead of its end, or beside it if another letter is there."""
+    ahead, across = 0.4 * end / size, LETTER * np.array([-end[1], end[0]]) / size
+    places = [end + ahead, end + across, end - across]
+    free = [place for place in places if all(np.linalg.norm(place - other) > LETTER for other in others)]
+    return np.asarray((free or places)[0])
 
 
 def _wrapped(text: str, inches: float, size: float) -> list[str]:

@@ -13,13 +13,14 @@ from magshell_fenicsx.output.pictures.colours import (
     Coloured,
     contact,
     contact_region,
+    few_cells_said,
     loads,
     moments,
     shell,
     strains,
     stretches,
 )
-from magshell_fenicsx.output.pictures.layout import Arrow, Panel, Pen, columns, drawing, panel_width, panels_figure
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel, columns, drawing, panel_width, panels_figure
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
 from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window, tessellated
 from magshell_fenicsx.problem.wanted import OutputSection
@@ -30,10 +31,14 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 NAMED = ("", "w_over_h")  # layers with the names of shells
 GREY = 0.93  # of a surface without colours
+NONE_BEYOND = 0.01  # of a bar: values no farther beyond its ends are those of the ends
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
 SEEN_APART = (
     2.0  # pixels between the outlines of the undeformed and of the deformed shell; nearer the former is no news
 )
+CRUMB = 40.0  # pixels: what is left of that outline is longer
+SAME_PLACE = 1e-7  # over R
+DIVISION = 8  # of a line between two nodes
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,8 @@ def _with_arrows(surface: Surface, h: float) -> Content:
 def _of_contact(surface: Surface) -> Content:
     layers = contact(surface)
     detail = contact_region(surface) if layers else None
-    return Content(layers, "" if detail is None else "The part of the shell around the contact.", detail)
+    notes = [] if detail is None else ["The part of the shell around the contact."]
+    return Content(layers, " ".join([*notes, few_cells_said(surface)] if layers else []).strip(), detail)
 
 
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {
@@ -98,27 +104,27 @@ class Background:
         self.seen = InView(pieces, r, camera, self.window)
         self._beside = Beside(surface, camera, self.window, self.seen)
         coarse = replace(self.window, scale=self.window.scale / 2)  # enough for a line that is wider than a pixel
-        drawn = silhouette(self.seen)
-        undeformed = apart(
-            silhouette(InView(pieces, surface.r0, camera, coarse)), drawn, SEEN_APART / self.window.scale
-        )
+        drawn, before = silhouette(self.seen), InView(pieces, surface.r0, camera, coarse)
+        near, crumb = SEEN_APART / self.window.scale, CRUMB / self.window.scale
+        undeformed = apart([self._not_behind(line, before) for line in silhouette(before)], drawn, near, crumb)
         self._lines = (
             *((line, UNDEFORMED) for line in undeformed),
             *((line, EDGE) for line in drawn),
+            *((line, EDGE) for line in apart([self._where_seen(rims(surface))], drawn, near)),
             *((line, OTHERS) for line in self._beside.lines),
-            *self._visible(bare_outlines(surface)),
+            *((self._where_seen(_divided(line)), OTHERS) for line in bare_outlines(surface)),
         )
 
-    def _visible(self, lines: Sequence[Array]) -> tuple[tuple[Array, Pen], ...]:
-        """Lines (n, 3) in the projection, without the parts that the shell hides."""
-        visible = []
-        for line in lines:
-            at = np.arange(8 * (len(line) - 1) + 1) / 8  # all corners among them
-            fine = np.column_stack([np.interp(at, np.arange(len(line)), x) for x in line.T])
-            places = self._camera(fine)[:, :2]
-            places[~self.seen.shows(fine, 2 / self.window.scale)] = np.nan
-            visible.append((places, OTHERS))
-        return tuple(visible)
+    def _not_behind(self, line: Array, before: InView) -> Array:
+        """A line (n, 2) around the undeformed shell, without what the deformed one hides."""
+        hidden = self.seen.depth_around(line) > before.depth_around(line) + SEEN_APART / self.window.scale
+        return np.where(hidden[:, None], np.nan, line)
+
+    def _where_seen(self, line: Array) -> Array:
+        """A line (n, 3) in the projection, without the parts that the shell hides."""
+        places = self._camera(line)[:, :2]
+        places[~self.seen.shows(np.nan_to_num(line), 2 / self.window.scale)] = np.nan
+        return places
 
     def panel(self, layer: Coloured, style: OutputSection) -> Panel:
         """The shell in a layer's colours; grey with arrows if it has none."""
@@ -130,7 +136,7 @@ class Background:
             return Panel(image, self.window, self._camera, lines=self._lines, arrows=arrows, texts=texts, names=names)
         low, high = style.ranges.get(layer.name, layer.limits)
         image = self.seen.coloured(layer.values, (low, high), colour_map(layer.colours, (low, high)))
-        slack = 1e-6 * (high - low)
+        slack = NONE_BEYOND * (high - low)
         beyond = bool(np.nanmin(layer.values) < low - slack), bool(np.nanmax(layer.values) > high + slack)
         scale = Scale((low, high), layer.colours, layer.caption, beyond)
         return Panel(self._whole(image), self.window, self._camera, scale, self._lines, texts=texts, names=names)
@@ -163,8 +169,8 @@ class Background:
         return drawn_arrows(self._surface, self._camera, lambda r: self.seen.shows(r, 0.03 * extent))
 
 
-def apart(lines: Sequence[Array], others: Sequence[Array], distance: float) -> list[Array]:
-    """Lines (n, 2) with nan where they are as near as that to others."""
+def apart(lines: Sequence[Array], others: Sequence[Array], distance: float, least: float = 0.0) -> list[Array]:
+    """Lines (n, 2) with nan where they are as near as that to others, or what is left is shorter than `least`."""
     from scipy.spatial import cKDTree
 
     if not len(others):
@@ -172,10 +178,45 @@ def apart(lines: Sequence[Array], others: Sequence[Array], distance: float) -> l
     near = cKDTree(np.concatenate(others))
     broken = []
     for line in lines:
-        far = near.query(line)[0] > distance
-        if far.any():
-            broken.append(np.where(far[:, None], line, np.nan))
+        far = near.query(np.nan_to_num(line))[0] > distance
+        left = np.where(far[:, None], line, np.nan)
+        part = np.cumsum(np.isnan(left[:, 0]))
+        steps = np.nan_to_num(np.linalg.norm(np.diff(left, axis=0, prepend=left[:1]), axis=1))
+        left[np.bincount(part, steps)[part] < least] = np.nan
+        if not np.isnan(left).all():
+            broken.append(left)
     return broken
+
+
+def rims(surface: Surface) -> Array:
+    """Places (n, 3) along the edges of a deformed mid-surface, which one triangle has alone; nan follows each."""
+    if surface.is_body:
+        return np.zeros((0, 3))
+    inner = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
+    along = [[k, *range(3 + k * inner, 3 + (k + 1) * inner), (k + 1) % 3] for k in range(3)]  # VTK's order
+    edges = surface.cells[:, along].reshape(-1, inner + 2)
+    _, place = np.unique(
+        np.round(surface.r0 / SAME_PLACE) + 0.0, axis=0, return_inverse=True
+    )  # nodes of two may be double
+    _, first, count = np.unique(
+        np.sort(place.ravel()[edges[:, [0, -1]]], axis=1), axis=0, return_index=True, return_counts=True
+    )
+    lines = (surface.r0 + surface.u)[edges[first[count == 1]]]
+    ended = np.concatenate([_divided_each(lines), np.full((len(lines), 1, 3), np.nan)], axis=1)
+    return np.asarray(ended.reshape(-1, 3))
+
+
+def _divided_each(lines: Array) -> Array:
+    """Lines (m, k, 3) with places between their own."""
+    at = np.arange(DIVISION * (lines.shape[1] - 1) + 1) / DIVISION
+    before = np.minimum(at.astype(int), lines.shape[1] - 2)
+    part = (at - before)[None, :, None]
+    return np.asarray((1 - part) * lines[:, before] + part * lines[:, before + 1])
+
+
+def _divided(line: Array) -> Array:
+    """A line (n, 3) with places between its own."""
+    return np.asarray(_divided_each(line[None])[0])
 
 
 def silhouette(seen: InView) -> list[Array]:

@@ -109,10 +109,11 @@ void paint(const double *places, const int32_t *triangles, const int32_t *index,
                                                  u * lamp[p[0]] + v * lamp[p[1]] + w * lamp[p[2]], one, relief, rim);
                     const float place = (value - low) / (high - low) * (colours - 1) + 0.5f;
                     const int32_t k = !(place > 0) ? 0 : place >= colours ? colours - 1 : (int32_t)place;
-                    for (int c = 0; c < 3; c++) {
-                        const float lit = light * table[3 * k + c];
-                        sum[c] += lit < 0 ? 0 : lit > 1 ? 1 : lit;
-                    }
+                    const float *const colour = table + 3 * k;
+                    float most = 1e-6f;
+                    for (int c = 0; c < 3; c++) most = colour[c] > most ? colour[c] : most;
+                    const float lit = light < 0 ? 0 : light * most > 1 ? 1 / most : light; /* no colour becomes another */
+                    for (int c = 0; c < 3; c++) sum[c] += lit * colour[c];
                     covered++;
                 }
             for (int c = 0; c < 3; c++) image[c] = covered ? (uint8_t)(255 * sum[c] / covered + 0.5f) : 255;

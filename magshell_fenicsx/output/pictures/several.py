@@ -1,6 +1,7 @@
 """More on a curve: those of several runs in one picture, and the shell at some points of one."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,14 +11,15 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.animation import edge_of, magnification
 from magshell_fenicsx.output.pictures.curve import MARK, draw_lines, drawn_points, legend
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, drawing
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, named, place
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.scales import number_format
-from magshell_fenicsx.output.pictures.view import Camera
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window
 from magshell_fenicsx.output.store.known import case_in, pole_of
-from magshell_fenicsx.output.store.table import SOLUTION, Row
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 from magshell_fenicsx.quantities.registry import QUANTITIES
 
@@ -29,6 +31,7 @@ Array = NDArray[np.float64]
 MOST_KEYS = 2  # of a case in the label of its run
 WIDE, TALL = 0.26, 0.34  # of a shell on a curve, over the axes
 GREY = 0.8
+DARK, RIM = 0.3, 0.8  # of the line around a shell, and how much of it is seen
 EACH_WAY, MARGIN = 9, 0.02  # places that are tried; the room around them, over the axes
 COVERED, MET = 12.0, 50.0  # how bad it is to cover all of the curve, or another shell, beside one width of the axes
 
@@ -124,37 +127,61 @@ def _said(value: Any) -> str:
 def add_shapes(
     figure: "Figure", parts: Sequence[Part], shapes: Sequence[tuple[Row, Surface]], style: OutputSection, camera: Camera
 ) -> None:
-    """Put the shell at some points on the curves of a figure, each where it covers least, with a line to its point."""
+    """Put the shell at some points on the curves of a figure, each where it covers least, with a line to its point.
+
+    All have one scale; displacements that would not be seen are drawn larger, which the title says.
+    """
     from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
+    on = [next((i for i in range(len(parts) - 1, -1, -1) if row in parts[i].rows), None) for row, _ in shapes]
+    factor = magnification([surface for _, surface in shapes])
+    moved = [replace(surface, u=factor * surface.u) for _, surface in shapes]
+    for number in dict.fromkeys(i for i in on if i is not None) if factor > 1 else ():
+        before = f"{figure.axes[number].get_title()}; " if figure.axes[number].get_title() else ""
+        figure.axes[number].set_title(rf"{before}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()
-    taken: dict[int, list[Array]] = {}
-    for row, surface in shapes:
-        number = next((i for i in range(len(parts) - 1, -1, -1) if row in parts[i].rows), None)
+    everything, taken = camera(np.concatenate([s.r0 + s.u for s in moved])), dict[int, list[Array]]()
+    for number, (row, _), surface in zip(on, shapes, moved, strict=True):
         if number is None:
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
-        image = Background(surface, camera, max(int(WIDE * box.width), 20)).plain(GREY)
-        if (less := TALL * box.height / image.shape[0]) < 1:
-            image = Background(surface, camera, max(int(less * WIDE * box.width), 8)).plain(GREY)
+        tall = Window.around(everything, 1000).shape[0] / 1000
+        width = max(int(min(WIDE * box.width, TALL * box.height / tall)), 8)
+        image = _drawn(Background(surface, camera, width, Window.around(everything, width)).plain(GREY))
         size = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         at = np.array(place(row, parts[number].amplitude))
         corner = _free(axes, at, size, taken.setdefault(number, []))
         taken[number].append(np.array([corner, corner + size]))
-        x, y = corner + size / 2
+        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": MARK / 2}
+        end = _nearest(axes, image, at, corner, size)
+        begin, (x, y) = (float(at[0]), float(at[1])), corner + size / 2
+        axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line, zorder=3)
         shown = OffsetImage(image, zoom=72 / figure.dpi, resample=True)
-        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkB": MARK / 2}
-        ends = (float(at[0]), float(at[1])), (float(x), float(y))
-        how: dict[str, Any] = {
-            "boxcoords": "axes fraction",
-            "frameon": False,
-            "pad": 0,
-            "arrowprops": line,
-            "zorder": 3,
-        }
-        axes.add_artist(AnnotationBbox(shown, *ends, **how))
-        axes.plot(*at, "o", color="k", markersize=MARK, zorder=5)
+        how: dict[str, Any] = {"xycoords": "axes fraction", "frameon": False, "pad": 0, "zorder": 3}
+        axes.add_artist(AnnotationBbox(shown, (float(x), float(y)), **how))
+        if row["label"] not in LOCATED:  # those have marks
+            axes.plot(*at, "o", color="k", markersize=MARK, zorder=5)
+
+
+def _drawn(image: Image) -> Image:
+    """The part of an image on which something is, with a line around that."""
+    part = image[..., 3:] / 255
+    edge = RIM * edge_of(part)
+    lined = image.copy()
+    lined[..., :3] = np.rint((1 - edge) * image[..., :3] + edge * 255 * DARK)
+    rows, across = (np.flatnonzero(part[..., 0].any(axis=axis)) for axis in (1, 0))
+    return lined[rows[0] : rows[-1] + 1, across[0] : across[-1] + 1]
+
+
+def _nearest(axes: "Axes", image: Image, at: Array, corner: Array, size: Array) -> tuple[float, float]:
+    """Where in the axes an image at a corner is nearest to a point of the data."""
+    down, right = np.nonzero(image[..., 3] > 127)
+    inside = corner + size * np.column_stack([(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]])
+    box = axes.get_window_extent()
+    target = axes.transAxes.inverted().transform(axes.transData.transform(at))
+    x, y = inside[np.linalg.norm((inside - target) * [box.width, box.height], axis=1).argmin()]
+    return float(x), float(y)
 
 
 def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array:

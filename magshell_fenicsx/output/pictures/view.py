@@ -140,6 +140,7 @@ FINER = 2  # drawn pixels along each side of a pixel of the picture
 LAMP = (-0.45, 0.55, 0.7)  # the way to the lamp: to the right, up, towards the eye
 RELIEF = 0.5  # of the light comes from the lamp, and falls on slopes alone
 RIM = 0.12  # loss of light where the surface is seen edgewise
+NEXT = (-2, -1, 0, 1, 2)  # drawn pixels around one
 AROUND = 0.02  # margin around what is drawn, over its largest side
 
 
@@ -233,6 +234,14 @@ class InView:
     def depth(self) -> NDArray[np.float32]:
         """Of what is in front, towards the eye, at FINER drawn pixels for each; -inf where the surface is not."""
         return self._depth
+
+    def depth_around(self, places: Array) -> Array:
+        """The largest depth (n,) of what is drawn at or next to places (n, 2) of the projection."""
+        left, _, _, high = self.window.box
+        height, width = self._depth.shape
+        x, y = (np.nan_to_num((places - [left, high]) * [1, -1]) * FINER * self.window.scale).astype(int).T
+        around = [(np.clip(y + j, 0, height - 1), np.clip(x + i, 0, width - 1)) for i in NEXT for j in NEXT]
+        return np.asarray(np.max([self._depth[at] for at in around], axis=0), np.float64)
 
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
         """The image (height, width, 4) of values (n,) at nodes, grey where they are nan; transparent around."""
@@ -334,10 +343,12 @@ def towards(place: Array, aside: float = -0.5) -> Array:
 
 
 def deflected_place(surface: Surface) -> Array:
-    """The point (3,) of the largest normal displacement."""
-    return np.asarray(surface.r0[np.argmax(np.abs(surface.w))])
+    """The middle (3,) of where the normal displacement is largest: of a ring its axis, whatever node is ahead."""
+    size = np.abs(surface.w)
+    return np.asarray(surface.r0[size >= ALIKE * size.max()].mean(axis=0))
 
 
+ALIKE = 0.999  # of the largest displacement: what is larger is that
 NO_VALUE = 0.86  # the grey of what has none
 NONE_HERE = 60  # brightness of 255 of what is white in any light
 FAR = 2.5  # of the shell's extent, from its middle: sources farther away are not drawn

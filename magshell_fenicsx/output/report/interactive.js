@@ -67,7 +67,8 @@
   const lighting = {ambient: 0.62, diffuse: 0.45, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0};
   const poles = [[0, "#5a85c7"], [0.5, "#5a85c7"], [0.5, "#cc5c54"], [1, "#cc5c54"]];
   const solids = () => about.solids[state.frame].map(s => {
-    const r = scaled(s.r), of = array(s.triangles);
+    const r = scaled(s.r), of = array(s.triangles), size = Math.max(...bounds().map(b => b[1] - b[0])), d = about.camera;
+    if (!s.poles.length) for (let i = 0; i < r.length; i++) r[i] += 0.008 * size * d[i % 3] / Math.hypot(...d); // what touches is not drawn in stripes
     const drawn = {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0, of), j: corner(1, of), k: corner(2, of),
       flatshading: false, lightposition: lamp, lighting, hovertemplate: `${s.name}<extra></extra>`, showscale: false};
     return s.poles.length ? {...drawn, intensity: s.poles, cmin: -1, cmax: 1, colorscale: poles} : {...drawn, color: "#8a9c9c", opacity: 0.35};
@@ -183,10 +184,17 @@
       }
     });
     const numbers = {}; about.points.map((_, i) => i).filter(isLocated).forEach((i, n) => { numbers[i] = n + 1; });
+    const marked = [...within].filter(isLocated), wide = Math.max(...x) - Math.min(...x) || 1, tall = Math.max(...y) - Math.min(...y) || 1;
+    const beside = i => { // a number stands away from the nearest other mark
+      const away = j => Math.hypot((x[j] - x[i]) / wide, (y[j] - y[i]) / tall), others = marked.filter(j => j !== i);
+      if (!others.length) return "top left";
+      const j = others.reduce((a, b) => away(b) < away(a) ? b : a);
+      return `${y[j] > y[i] ? "bottom" : "top"} ${x[j] > x[i] ? "left" : "right"}`;
+    };
     for (const [kind, symbol] of [["fold", "circle-open"], ["bifurcation", "diamond-open"]]) {
       const here = [...within].filter(i => about.labels[i] === kind);
-      if (here.length) traces.push({x: here.map(i => x[i]), y: here.map(i => y[i]), customdata: here, mode: "markers+text", text: here.map(i => `${numbers[i]}`), textposition: "top left",
-        marker: {size: 8, symbol, color: "#d62728", line: {width: 2}}, hovertemplate: here.map(hover), ...once(kind)});
+      if (here.length) traces.push({x: here.map(i => x[i]), y: here.map(i => y[i]), customdata: here, mode: "markers+text", text: here.map(i => `${numbers[i]}`), textposition: here.map(beside),
+        marker: {size: 7, symbol, color: "#d62728", line: {width: 1.5}}, hovertemplate: here.map(hover), ...once(kind)});
     }
     const found = [...within].filter(i => about.labels[i] === "solution");
     if (found.length) traces.push({x: found.map(i => x[i]), y: found.map(i => y[i]), customdata: found, mode: "markers", hovertemplate: found.map(hover),
