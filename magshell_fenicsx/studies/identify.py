@@ -35,6 +35,7 @@ from magshell_fenicsx.studies.identify_data import (
 from magshell_fenicsx.studies.identify_field import NAME, field_of, flux_density
 from magshell_fenicsx.studies.identify_picture import draw_identified
 from magshell_fenicsx.studies.identify_predicted import Predictor
+from magshell_fenicsx.studies.identify_programmes import Programme, programme
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
 from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
@@ -121,13 +122,16 @@ def identify(
         names = Names(case)
         others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
         _refuse_few(table, parameters)
+        programmes = [programme(name, source, parameters, each, made) for name, each in section.predict.items()]
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
             mark = identity(case) + repr([each.key for each in parameters])
             predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field)
             done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
-            by_first(comm, lambda: _write(done, drawn, folder, predictor))
+            for each in programmes:
+                each.compute(predictor, done.fit, say)
+            by_first(comm, lambda: _write(done, drawn, folder, predictor, programmes))
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
     for line in done.content["said"]:
@@ -213,6 +217,7 @@ def _identified(
     content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
     content["predicted"], content["next"] = _others(predictor, section, fit, others)
     content["evaluations"] = predictor.count
+    content["programmes"] = {}
     content["said"] = sentences(content, fit, table)
     drawn = partial(draw_identified, content, _curves(predictor, table, fit))
     return Identified(content, fit), drawn
@@ -366,7 +371,18 @@ def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tupl
     return curves
 
 
-def _write(done: Identified, drawn: Callable[[Path], None], folder: Path, predictor: Predictor) -> None:
+def _write(
+    done: Identified,
+    drawn: Callable[[Path], None],
+    folder: Path,
+    predictor: Predictor,
+    programmes: Sequence[Programme],
+) -> None:
+    for each in programmes:
+        found = each.found(folder, done.fit, done.content["noise"])
+        done.content["programmes"][each.name] = found.content
+        done.content["said"] += found.said
+        found.write(folder)
     write_object(folder / "identify.json", done.content)
     rows = done.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")
