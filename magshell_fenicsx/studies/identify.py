@@ -4,7 +4,7 @@ Every evaluation is kept: an identification that is started again takes those in
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
@@ -125,7 +125,7 @@ def identify(
         programmes = [programme(name, source, parameters, each, made) for name, each in section.predict.items()]
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
-            mark = identity(case) + repr([each.key for each in parameters])
+            mark = identity(made(_without_predictions(wider))) + repr([each.key for each in parameters])
             predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field)
             done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
@@ -137,6 +137,12 @@ def identify(
     for line in done.content["said"]:
         once(line)
     return done
+
+
+def _without_predictions(source: Source) -> Source:
+    """The case as far as the fit depends on it: another prediction makes no evaluation new."""
+    section = {key: value for key, value in source.data["identify"].items() if key != "predict"}
+    return replace(source, data={**source.data, "identify": section})
 
 
 def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
