@@ -186,7 +186,7 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
         labels = {"95 %, data", "95 %, curve", "predicted", "measured"}  # each once
         own = [row for row in rows if row["result"] == column]
         for _, of_step in groupby(own, key=lambda row: int(row["step"])):
-            _programme_of_step(plot, list(of_step), place, labels)
+            _programme_of_step(plot, sorted(of_step, key=lambda row: float(row[place])), place, labels)
         plot.set(xlabel=result_label(place), ylabel=result_label(column))
         plot.legend(frameon=False, fontsize=8)
     figure.suptitle(name.replace("_", " "))

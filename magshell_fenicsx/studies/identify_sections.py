@@ -73,8 +73,8 @@ class ProgrammeSection(Section):
     """Further results: a column, along the last step; or a number, as of a sweep: `time_s@tip_uz_mm=-2`, `knockdown`"""
     changes: list[str] = Field(default_factory=list)
     """Columns that are counted from the begin of their step on"""
-    samples: int = Field(default=40, ge=8, le=10_000)
-    """Runs with drawn parameters"""
+    samples: int = Field(default=40, ge=20, le=10_000)
+    """Runs with drawn parameters; of fewer than 20 none is as far out as a 95 % band"""
 
     @model_validator(mode="after")
     def _something_is_predicted(self) -> Self:

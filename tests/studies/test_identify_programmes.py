@@ -82,7 +82,7 @@ def test_bands_of_another_history(tmp_path: Path) -> None:
         ("identify.predict.turned.data=no_unit.csv", "no_unit.csv: tip_uz: has no unit: write tip_uz"),
         ("identify.predict.turned.data=step.csv", "step.csv: a row has no place, or no step of 1 to 1"),
         ("identify.predict={a b: {of: [knockdown]}}", "a b: a name has letters, digits and _ alone"),
-        ("identify.predict.turned={samples: 9}", "give data, of, or both: nothing is predicted"),
+        ("identify.predict.turned={samples: 30}", "give data, of, or both: nothing is predicted"),
     ],
 )
 def test_what_predicts_nothing(tmp_path: Path, setting: str, said: str) -> None:
