@@ -106,9 +106,11 @@ def check(case: CaseFile, set_: Settings = None) -> None:
                 refuse_unfit_numbers(source, read, read.design)
         if read.identify:
             from magshell_fenicsx.studies.identify_data import refuse_unfit_section
+            from magshell_fenicsx.studies.identify_programmes import refuse_unfit_programmes
 
             with _placed(read):
                 refuse_unfit_section(source, read, read.identify)
+                refuse_unfit_programmes(source, read, read.identify, Case.from_source)
     refuse_lost()
 
 

@@ -47,11 +47,17 @@ def _text(file: Path) -> str:
 
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
-    """The case, and the mesh file that it names or the data of its name, which come to stand beside it."""
-    text, mesh = _text(source), (read_source(source).data.get("shell") or {}).get("file")
-    data = source.with_suffix(".csv")
+    """The case, and the mesh file that it names or the data of its name, which come to stand beside it.
+
+    So do the cases and data that it predicts.
+    """
+    text, given = _text(source), read_source(source).data
+    mesh, data = (given.get("shell") or {}).get("file"), source.with_suffix(".csv")
     if data.exists():
-        return {target: text.encode(), target.with_suffix(".csv"): data.read_bytes()}
+        predicted = (given.get("identify") or {}).get("predict") or {}
+        named = [each[of] for each in predicted.values() for of in ("case", "data") if of in each]
+        others = {target.parent / file: _text(source.parent / file).encode() for file in named}
+        return {target: text.encode(), target.with_suffix(".csv"): data.read_bytes(), **others}
     if mesh is None:
         return {target: text.encode()}
     beside = Path(mesh).name

@@ -14,7 +14,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
 from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
-from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, third, times_tangent
+from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, offset, times_tangent
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
 
@@ -24,7 +24,15 @@ SOLVES = 25  # of the power iteration for a second eigenvalue near zero
 
 
 class Family(Protocol):
-    """Systems that differ by a number p, with the same unknowns."""
+    """Systems that differ by a number p, with the same unknowns.
+
+    Attributes
+    ----------
+    costly
+        Whether a system of another p is made anew: points are then taken at given p where that is possible.
+    """
+
+    costly: bool
 
     def at(self, p: float) -> BorderedNewton:
         """The solver of the system at p; it may raise `NoSystem`."""
@@ -32,8 +40,11 @@ class Family(Protocol):
     def amplitudes(self, p: float) -> dict[str, float]:
         """The amplitudes beside the one that is unknown."""
 
-    def beside(self, p: float) -> Sequence[tuple[float, float]]:
-        """Weights and values of p of a difference: the derivative by p is the weighted sum of what is there."""
+    def beside(self, p: float, *, rough: bool = False) -> Sequence[tuple[float, float]]:
+        """Weights and values of p of a difference: the derivative by p is the weighted sum of what is there.
+
+        A rough one is of first order, from p itself and one more value.
+        """
 
 
 class NoSystem(RuntimeError):
@@ -101,6 +112,7 @@ class Lines:
         name: str,
         tangent: AugmentedTangent,
         family: Family,
+        p: float,
         beside: Sequence[tuple[float, float]],
         scales: tuple[float, float],
     ) -> None:
@@ -108,14 +120,24 @@ class Lines:
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
         own = {name: state.mu[name]}
         self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
-        v, u = tangent.v, state.u
-        self.w_R, self.t_R = tangent.solve(system.residual(u, state.mu))
-        self._R_mu = system.load(u, state.mu, name)
-        self.w_mu, self.t_mu = tangent.solve(self._R_mu)
-        self.w_p, self.t_p = tangent.solve(self._by_p(lambda other, mu: other.residual(u, mu)))
-        self.cubic = third(system, state, v)
-        self.K_mu_v = first_difference(lambda x: system.load(x, state.mu, name), system, u, v)
-        self.K_p_v = self._by_p(lambda other, mu: times_tangent(other, State(u, mu), v))
+        v, u, mu = tangent.v, state.u, state.mu
+        self._R = system.residual(u, mu)
+        self.w_R, self.t_R = tangent.solve(self._R)
+        self.w_mu, self.t_mu = tangent.solve(system.load(u, mu, name))
+        d = offset(system, v)
+        ahead, back = (system.residual(u + way * d * v, mu) for way in (1, -1))
+        self.cubic = np.asarray((back - 2 * self._R + ahead) / d**2)
+        self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
+        R_p, self.K_p_v = self._derivatives_by_p([p == q for _, q in beside], d, ahead, back)
+        self.w_p, self.t_p = tangent.solve(R_p)
+
+    def _derivatives_by_p(self, itself: Sequence[bool], d: float, ahead: Vector, back: Vector) -> tuple[Vector, Vector]:
+        """R_p and K_p v; at this p itself R is known, and ahead and back at u + d v and u - d v."""
+        u, v, R_p, K_p_v = self._state.u, self._tangent.v, 0.0 * self._R, 0.0 * self._R
+        for same, (weight, other, mu) in zip(itself, self._others, strict=True):
+            R_p += weight * (self._R if same else other.residual(u, mu))
+            K_p_v += weight * ((ahead - back) / (2 * d) if same else times_tangent(other, State(u, mu), v))
+        return R_p, K_p_v
 
     def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
         """The derivative by p at fixed u and amplitude."""
@@ -157,7 +179,7 @@ class Lines:
         """The row v . R_mu = 0, with v' = -K^-1 K' v."""
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
         v, w = self._tangent.v, self.w_mu
-        mixed = mixed_third(system, state, v, w) - self.K_mu_v
+        mixed = mixed_third(system, state, v, w, self._R) - self.K_mu_v
         self._largest = dot(comm, np.abs(mixed), np.abs(v))
         mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
         ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))

@@ -148,13 +148,15 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
     return np.asarray((ahead - back) / (2 * d))
 
 
-def mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
-    """Pi'''(v, w, .), by polarisation."""
+def mixed(system: System, state: State, v: Vector, w: Vector, residual: Vector | None = None) -> Vector:
+    """Pi'''(v, w, .), by polarisation; the residual at the state may be known."""
     comm = system.comm
     size = max_abs(comm, w) / max_abs(comm, v)
     if size == 0.0:
         return np.zeros_like(v)
-    return size / 4 * (third(system, state, v + w / size) - third(system, state, v - w / size))
+    residual = system.residual(state.u, state.mu) if residual is None else residual
+    plus, minus = (third(system, state, v + sign * w / size, residual) for sign in (1, -1))
+    return np.asarray(size / 4 * (plus - minus))
 
 
 def _done(sizes: Sequence[float]) -> bool:

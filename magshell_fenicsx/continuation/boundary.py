@@ -26,6 +26,7 @@ MOST_TURN, STRAIGHT = 0.6, 0.95  # cosines of successive tangents: less is refus
 GAP = 0.5  # of a step: a larger correction of its prediction counts as a jump
 ALIKE = 0.5  # cosine of successive null vectors
 SMALLEST = 1e-4  # of the first step
+STEEP = 0.2  # part of p in the tangent from which costly systems are taken at a given p
 SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
 MOST_TRIALS, MOST_POINTS = 12, 400
 MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
@@ -115,19 +116,20 @@ class Boundary:
                     return
             tried: Locus | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
-                tried = self._at_distance(here, guess, length)
+                tried = self._onward(here, guess, length)
             if isinstance(tried, str):
                 length /= 2
                 if length < SMALLEST * first:
                     raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {tried}")
                 continue
-            yield from self._between(here, tried, length)
+            step = self._distance(here, tried, length)
+            yield from self._between(here, tried, step)
             if not ends[0] < tried.p < ends[1]:  # the prediction had not shown it
                 length /= 2
                 continue
             yield "point", tried
             straight = self.inner(here.way, tried.way) > STRAIGHT
-            step, before, here = length, (here, length), tried
+            before, here = (here, step), tried
             if tried.factorisations <= EASY and straight:
                 length = 1.5 * length
             elif tried.factorisations > 2 * EASY:
@@ -171,6 +173,24 @@ class Boundary:
             at(low.p, low.way.dp, high.p, high.way.dp),
         )
 
+    def _onward(self, here: Locus, guess: Way, length: float) -> Locus | str:
+        """The next point: where it is predicted in p if systems are costly, else at a distance."""
+        if not self._at_given_p(here):
+            return self._at_distance(here, guess, length)
+        row = Row(None, 0.0, 1.0, lambda u, mu, p: p - guess.dp)
+        return self._tried(here, guess, length, row, rough=True)
+
+    def _at_given_p(self, here: Locus) -> bool:
+        return self.family.costly and abs(here.way.dp) / self.scales[1] > STEEP
+
+    def _distance(self, here: Locus, there: Locus, length: float) -> float:
+        """Along the tangent of the first point; the length of the step where it was taken at that."""
+        if not self._at_given_p(here):
+            return length
+        name = self.name
+        off = Way(there.state.u - here.state.u, there.state.mu[name] - here.state.mu[name], there.p - here.p)
+        return self.inner(here.way, off)
+
     def _at_distance(self, base: Locus, guess: Way, length: float, *, look: bool = False) -> Locus | str:
         """The point at a distance along the tangent of another one."""
         way, (mu, p), name = base.way, self.scales, self.name
@@ -179,13 +199,19 @@ class Boundary:
             return self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
 
         row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
-        point = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look)
+        return self._tried(base, guess, length, row, look=look)
+
+    def _tried(
+        self, base: Locus, guess: Way, length: float, row: Row, *, look: bool = False, rough: bool = False
+    ) -> Locus | str:
+        name = self.name
+        point = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look, rough=rough)
         if isinstance(point, str):
             return point
         off = Way(point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp)
         if np.sqrt(self.inner(off, off)) > GAP * abs(length):
             return "a step ends far from its prediction"
-        if self.inner(way, point.way) < MOST_TURN:
+        if self.inner(base.way, point.way) < MOST_TURN:
             return "the boundary turns too sharply"
         return point
 
@@ -201,7 +227,8 @@ class Boundary:
         guess = self._ahead(before, here, high)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
         row = Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
-        last = self._solved(end, State(guess.du, {self.name: guess.dmu}), here.phi, row, here)
+        guessed, rough = State(guess.du, {self.name: guess.dmu}), self._at_given_p(here)
+        last = self._solved(end, guessed, here.phi, row, here, rough=rough)
         if isinstance(last, str) or last.way.dp * here.way.dp < 0 or self.inner(last.way, here.way) < MOST_TURN:
             return None
         off = Way(last.state.u - guess.du, last.state.mu[self.name] - guess.dmu, 0.0)
@@ -255,27 +282,38 @@ class Boundary:
         return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
 
     def _solved(
-        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool = False
+        self,
+        p: float,
+        state: State,
+        b: Vector,
+        row: Row,
+        near: Locus | None,
+        *,
+        look: bool = False,
+        rough: bool = False,
     ) -> Locus | str:
         """The point near a guess on which a row holds, or the reason why there is none."""
-        return self._recorded(lambda: self._by_newton(p, state, b, row, near, look=look))
 
-    def _by_newton(self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool) -> Locus | str:
-        try:
-            return self._iterated(float(p), state, b, row, near, look=look)
-        except NoSystem as e:
-            return str(e)
+        def by_newton() -> Locus | str:
+            try:
+                return self._iterated(float(p), state, b, row, near, look=look, rough=rough)
+            except NoSystem as e:
+                return str(e)
 
-    def _iterated(self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool) -> Locus | str:
+        return self._recorded(by_newton)
+
+    def _iterated(
+        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool, rough: bool
+    ) -> Locus | str:
         u, mu, name = state.u, float(state.mu[self.name]), self.name
-        beside = self.family.beside(p)
+        beside = self.family.beside(p, rough=rough)
         sizes, changes = list[float](), list[float]()
         while True:
             newton = self.family.at(p)
             system, latest = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
                 tangent = AugmentedTangent(newton, latest, b)
-                lines = Lines(system, latest, name, tangent, self.family, beside, self.scales)
+                lines = Lines(system, latest, name, tangent, self.family, p, beside, self.scales)
                 way = lines.step(self.kind, row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"

@@ -139,10 +139,11 @@ def held_along(
         u, last, own, stress = u - du, size, False, followed(u, -du)
 
 
-def third(system: System, state: State, v: Vector) -> Vector:
-    """Pi'''(v, v, .), by a second difference of the residual."""
-    d = _offset(system, v)
-    back, residual, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 0, 1))
+def third(system: System, state: State, v: Vector, residual: Vector | None = None) -> Vector:
+    """Pi'''(v, v, .), by a second difference of the residual, which may be known at the state itself."""
+    d = offset(system, v)
+    back, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 1))
+    residual = system.residual(state.u, state.mu) if residual is None else residual
     return np.asarray((back - 2 * residual + ahead) / d**2)
 
 
@@ -153,11 +154,18 @@ def times_tangent(system: System, state: State, v: Vector) -> Vector:
 
 def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v: Vector) -> Vector:
     """Derivative of f at u along v."""
-    d = _offset(system, v)
+    d = offset(system, v)
     return np.asarray((f(u + d * v) - f(u - d * v)) / (2 * d))
 
 
-def _offset(system: System, v: Vector) -> float:
+def offset(system: System, v: Vector) -> float:
+    """Of a difference along v.
+
+    Raises
+    ------
+    LinAlgError
+        If v is zero.
+    """
     size = max_abs(system.comm, v)
     if size == 0.0:
         raise np.linalg.LinAlgError

@@ -182,11 +182,24 @@ class Varied:
         """The amplitudes beside that of the instability."""
         return self._fixed(self._base if self.alone else self._stage(p), p)
 
-    def beside(self, p: float) -> list[tuple[float, float]]:
-        """Weights and values of a difference of second order, on the side where values are allowed."""
+    @property
+    def costly(self) -> bool:
+        """Whether each value has a scene of its own."""
+        return not self.alone
+
+    def beside(self, p: float, *, rough: bool = False) -> list[tuple[float, float]]:
+        """Weights and values of a difference of second order, on the side where values are allowed; a rough one of
+        first order, with one scene beside that of p itself.
+        """
         d = STEP * abs(self._ends[1] - self._ends[0])
         if self._line:
             return [(0.5 / d, p + d), (-0.5 / d, p - d)]
+        if rough:
+            try:
+                self.problem(p + d)
+            except NoSystem:
+                d = -d
+            return [(1 / d, p + d), (-1 / d, p)]
         try:
             for q in (p - d, p + d):
                 self.problem(q)

@@ -4,7 +4,7 @@ Every evaluation is kept: an identification that is started again takes those in
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
@@ -35,6 +35,7 @@ from magshell_fenicsx.studies.identify_data import (
 from magshell_fenicsx.studies.identify_field import NAME, field_of, flux_density
 from magshell_fenicsx.studies.identify_picture import draw_identified
 from magshell_fenicsx.studies.identify_predicted import Predictor
+from magshell_fenicsx.studies.identify_programmes import Programme, programme
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
 from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
@@ -121,18 +122,27 @@ def identify(
         names = Names(case)
         others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
         _refuse_few(table, parameters)
+        programmes = [programme(name, source, parameters, each, made) for name, each in section.predict.items()]
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
-            mark = identity(case) + repr([each.key for each in parameters])
+            mark = identity(made(_without_predictions(wider))) + repr([each.key for each in parameters])
             predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field)
             done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
-            by_first(comm, lambda: _write(done, drawn, folder, predictor))
+            for each in programmes:
+                each.compute(predictor, done.fit, say)
+            by_first(comm, lambda: _write(done, drawn, folder, predictor, programmes))
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
     for line in done.content["said"]:
         once(line)
     return done
+
+
+def _without_predictions(source: Source) -> Source:
+    """The case as far as the fit depends on it: another prediction makes no evaluation new."""
+    section = {key: value for key, value in source.data["identify"].items() if key != "predict"}
+    return replace(source, data={**source.data, "identify": section})
 
 
 def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
@@ -213,6 +223,7 @@ def _identified(
     content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
     content["predicted"], content["next"] = _others(predictor, section, fit, others)
     content["evaluations"] = predictor.count
+    content["programmes"] = {}
     content["said"] = sentences(content, fit, table)
     drawn = partial(draw_identified, content, _curves(predictor, table, fit))
     return Identified(content, fit), drawn
@@ -366,7 +377,18 @@ def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tupl
     return curves
 
 
-def _write(done: Identified, drawn: Callable[[Path], None], folder: Path, predictor: Predictor) -> None:
+def _write(
+    done: Identified,
+    drawn: Callable[[Path], None],
+    folder: Path,
+    predictor: Predictor,
+    programmes: Sequence[Programme],
+) -> None:
+    for each in programmes:
+        found = each.found(folder, done.fit, done.content["noise"])
+        done.content["programmes"][each.name] = found.content
+        done.content["said"] += found.said
+        found.write(folder)
     write_object(folder / "identify.json", done.content)
     rows = done.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")

@@ -161,3 +161,51 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
     plot.set_yticks(range(len(names)), names, fontsize=8)
     plot.set(xlabel="95 % bands: data (blue), prior (grey), in %", xlim=(-120 * widest, 120 * widest))
     plot.axvline(0.0, color="0.4", lw=0.6)
+
+
+def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> None:
+    """Draw what is predicted of another history with its bands, and what was measured of it; a panel for each column.
+
+    Parameters
+    ----------
+    rows
+        As in the table of the programme.
+    place
+        The column of the places.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    columns = list(dict.fromkeys(row["result"] for row in rows))
+    figure, plots = plt.subplots(
+        1, len(columns), figsize=(4.6 * len(columns), 3.6), layout="constrained", squeeze=False
+    )
+    for plot, column in zip(plots[0], columns, strict=True):
+        labels = {"95 %, data", "95 %, curve", "predicted", "measured"}  # each once
+        own = [row for row in rows if row["result"] == column]
+        for _, of_step in groupby(own, key=lambda row: int(row["step"])):
+            _programme_of_step(plot, sorted(of_step, key=lambda row: float(row[place])), place, labels)
+        plot.set(xlabel=result_label(place), ylabel=result_label(column))
+        plot.legend(frameon=False, fontsize=8)
+    figure.suptitle(name.replace("_", " "))
+    figure.savefig(file, dpi=200)
+    plt.close(figure)
+
+
+def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[str]) -> None:
+    def label(text: str) -> str:
+        there = text in labels
+        labels.discard(text)
+        return text if there else ""
+
+    def get(of: str) -> Array:
+        return np.array([np.nan if row[of] == "" else row[of] for row in rows], dtype=float)
+
+    x, bands = get(place), (("low_measured", "high_measured", 0.12, "95 %, data"), ("low", "high", 0.35, "95 %, curve"))
+    for low, high, alpha, text in bands:
+        plot.fill_between(x, get(low), get(high), color="C0", alpha=alpha, lw=0, label=label(text))
+    plot.plot(x, get("predicted"), color="C0", lw=1.2, label=label("predicted"))
+    if np.isfinite(get("measured")).any():
+        plot.plot(x, get("measured"), ".", color="C1", ms=4, zorder=5, label=label("measured"))

@@ -69,7 +69,7 @@ class Predictor:
     readings: dict[Settings, list[Reading]]
     folder: Path
     mark: str
-    comm: MPI.Comm
+    comm: MPI.Intracomm
     field: RemanenceField | None = None
     count: int = 0
 
@@ -83,13 +83,14 @@ class Predictor:
         if seen is None:
             vectors = file.with_suffix(".csv")
             if self.field:
-                by_first(self.comm, lambda: self._write(x, vectors))
+                by_first(self.comm, lambda: self.write(x, vectors))
             seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
             self.count += 1
             from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)}))
         return seen
 
-    def _write(self, x: Array, vectors: Path) -> None:
+    def write(self, x: Array, vectors: Path) -> None:
+        """Write the vectors of a field."""
         assert self.field
         vectors.parent.mkdir(parents=True, exist_ok=True)
         self.field.write(x[len(self.parameters) :], vectors)
@@ -112,10 +113,15 @@ class Predictor:
             seen.curves = seen.curves or readings.curves
         return seen
 
-    def _scene(self, x: Array, settings: Settings, vectors: Path) -> Scene:
-        source = varied(self.source, [each.number for each in self.parameters], x[: len(self.parameters)])
+    def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
+        """A case, this or another one, for a vector of parameters; those of a field are in a file."""
+        source = varied(base, [each.number for each in self.parameters], x[: len(self.parameters)])
         if self.field:
             self.field.put(source.data, vectors)
+        return source
+
+    def _scene(self, x: Array, settings: Settings, vectors: Path) -> Scene:
+        source = self.source_at(x, self.source, vectors)
         for setting in settings:
             override(source, setting)
         return Scene(self.made(source).problem(), self.comm)

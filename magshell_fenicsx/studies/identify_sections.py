@@ -1,5 +1,6 @@
 """The section `identify` of a case: which numbers are looked for, what is known of them, what else may be measured."""
 
+import re
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -54,6 +55,34 @@ class CandidateSection(Section):
     """Standard deviation of such a measurement"""
 
 
+class ProgrammeSection(Section):
+    """A case that is predicted with the parameters found: this one with other settings, or another case file.
+
+    It is run at the fit and for parameters drawn from the posterior; between the quantiles of these runs lie 95 % of
+    them. Motions, snaps and several steps are predicted too, as a run follows them.
+    """
+
+    case: str | None = None
+    """Another case file, beside this one, which has the same keys; by default this case"""
+    settings: list[str] = Field(default_factory=list)
+    """Other values in that case, as for `--set`: `["loading.3.duration=2 s"]`"""
+    data: str | None = None
+    """A CSV file to compare with: columns of path.csv with units. The first one is the place, such as `time [s]` or
+    `applied [mT]`; a column `step` has the number of the step, by default the last one"""
+    of: list[str] = Field(default_factory=list)
+    """Further results: a column, along the last step; or a number, as of a sweep: `time_s@tip_uz_mm=-2`, `knockdown`"""
+    changes: list[str] = Field(default_factory=list)
+    """Columns that are counted from the begin of their step on"""
+    samples: int = Field(default=40, ge=20, le=10_000)
+    """Runs with drawn parameters; of fewer than 20 none is as far out as a 95 % band"""
+
+    @model_validator(mode="after")
+    def _something_is_predicted(self) -> Self:
+        if not (self.data or self.of):
+            raise ValueError("give data, of, or both: nothing is predicted")
+        return self
+
+
 class IdentifySection(Section):
     """What `magshell identify` looks for; every other command takes the case without it.
 
@@ -74,6 +103,8 @@ class IdentifySection(Section):
     """Columns of the data that are measured from the begin of the last step on"""
     candidates: list[CandidateSection] = Field(default_factory=list)
     """Results to predict, of which one may be measured next"""
+    predict: dict[str, ProgrammeSection] = Field(default_factory=dict)
+    """Name -> another history, or another case, that is predicted with the parameters found"""
     narrow: str | None = None
     """The parameter that the next measurement should narrow; by default the one with the largest relative deviation"""
     steps: int = Field(default=20, ge=1, le=1000)
@@ -83,6 +114,12 @@ class IdentifySection(Section):
     def _something_is_looked_for(self) -> Self:
         if not (self.parameters or self.remanence):
             raise ValueError("give parameters, remanence, or both: nothing is looked for")
+        return self
+
+    @model_validator(mode="after")
+    def _names_are_words(self) -> Self:
+        if strange := next((name for name in self.predict if not re.fullmatch(r"\w+", name)), None):
+            raise ValueError(f"predict: {strange}: a name has letters, digits and _ alone, as files have it")
         return self
 
     @model_validator(mode="after")

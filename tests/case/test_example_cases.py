@@ -43,6 +43,7 @@ def test_where_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert write_example("hinged_roof_12.7") == [Path("hinged_roof_12.7.yaml")]
     assert write_example("gripper") == [Path("gripper.yaml"), Path("gripper.msh")]
     assert write_example("gripper", Path("other.yaml")) == [Path("other.yaml"), Path("gripper.msh")]
+    assert write_example("identify_arch")[2:] == [Path("arch_snap.yaml"), Path("arch_triangle.csv")]
     write_example("gripper", Path("deep/other.yaml"))
     assert sorted(file.name for file in (tmp_path / "deep").iterdir()) == ["gripper.msh", "other.yaml"]
 

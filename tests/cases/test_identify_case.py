@@ -19,7 +19,7 @@ def test_identify_arch(tmp_path: Path) -> None:
     head, *lines = (CASES / "identify_arch.csv").read_text(encoding="utf-8").splitlines()
     data = tmp_path / "each_third.csv"
     data.write_text("\n".join([head, *lines[::3]]), encoding="utf-8")
-    coarse = ["mesh={size: 20 mm, degree: 3}", "loading.1.points=5", "identify.candidates=[]"]
+    coarse = ["mesh={size: 20 mm, degree: 3}", "loading.1.points=5", "identify.candidates=[]", "identify.predict={}"]
     found = ms.identify(CASES / "identify_arch.yaml", data, coarse, tmp_path / "out")
     keys = ("shell.youngs_modulus", "magnetic.remanent.flux_density")
     modulus, remanence = (found.parameters[key] for key in keys)

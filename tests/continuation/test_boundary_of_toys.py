@@ -1,7 +1,7 @@
 """Boundaries of stability of toys, known in closed form."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -18,15 +18,18 @@ class OfToys:
     """Toys that differ by p."""
 
     toy: Callable[[float], Toy]
+    costly: bool = False
+    made: set[float] = field(default_factory=set)
 
     def at(self, p: float) -> BorderedNewton:
+        self.made.add(p)
         return BorderedNewton(self.toy(p))
 
     def amplitudes(self, p: float) -> dict[str, float]:
         return {}
 
-    def beside(self, p: float) -> list[tuple[float, float]]:
-        return [(500.0, p + 1e-3), (-500.0, p - 1e-3)]
+    def beside(self, p: float, *, rough: bool = False) -> list[tuple[float, float]]:
+        return [(1e4, p + 1e-4), (-1e4, p)] if rough else [(500.0, p + 1e-3), (-500.0, p - 1e-3)]
 
 
 def arch(rise: float) -> Toy:
@@ -53,16 +56,21 @@ def load_of(a: float, rise: float) -> float:
 
 
 def followed(
-    kind: Kind, rise: float, a: float, phi: list[float], ends: tuple[float, float]
+    kind: Kind, rise: float, a: float, phi: list[float], ends: tuple[float, float], toys: OfToys | None = None
 ) -> list[tuple[Label, Locus]]:
-    boundary = Boundary(OfToys(arch), "load", kind, (10.0, ends[1] - ends[0]))
+    boundary = Boundary(toys or OfToys(arch), "load", kind, (10.0, ends[1] - ends[0]))
     start = boundary.start(rise, State(np.array([rise - a, 0.0]), {"load": load_of(a, rise)}), np.array(phi))
     return [("start", start), *boundary.followed(start, -1.0, ends, 20)]
 
 
-def test_folds_through_a_cusp() -> None:
-    """Folds at a^2 = (e^2 - 1)/3, born at e = 1, where the load is 2; no antisymmetric mode below e^2 = 5.5."""
-    found = followed("fold", 2.2, np.sqrt((2.2**2 - 1) / 3), [1.0, 0.0], (0.5, 2.3))
+@pytest.mark.parametrize("costly", [False, True])
+def test_folds_through_a_cusp(costly: bool) -> None:
+    """Folds at a^2 = (e^2 - 1)/3, born at e = 1, where the load is 2; no antisymmetric mode below e^2 = 5.5.
+
+    Where each p costs a system, a point far from the cusp takes two of them.
+    """
+    toys = OfToys(arch, costly)
+    found = followed("fold", 2.2, np.sqrt((2.2**2 - 1) / 3), [1.0, 0.0], (0.5, 2.3), toys)
     for _, locus in found:
         a = locus.p - locus.state.u[0]
         assert 3 * a**2 == pytest.approx(locus.p**2 - 1, abs=1e-6)
@@ -74,6 +82,8 @@ def test_folds_through_a_cusp() -> None:
     assert found[-1][1].p == 2.3
     assert found[-1][1].state.u[0] > 2.3  # the lower fold
     assert sum(locus.factorisations for _, locus in found) < 4 * len(found)
+    if costly:
+        assert sum(p > 1.5 for p in toys.made) < 2.6 * sum(locus.p > 1.5 for _, locus in found)
 
 
 def test_a_fold_meets_a_bifurcation() -> None:

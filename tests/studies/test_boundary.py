@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import magshell, read_path
+from command import magshell, read_path, started
 from conftest import CASES
 
 import magshell_fenicsx as ms
@@ -139,6 +139,37 @@ def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
 
 class Killed(Exception):
     pass
+
+
+@pytest.mark.slow
+def test_from_a_point_on_two_ranks_and_after_an_interruption(tmp_path: Path) -> None:
+    """The lower fold, which a case does not end at: the same rows on one rank and on two, whole and in two parts."""
+    run = tmp_path / "run"
+    words = [f"{KEY}=1.3", "loading.1.until=points", "loading.1.points=80"]
+    settings = [word for setting in words for word in ("--set", setting)]
+    assert magshell("run", ARCH, *settings, "--out", run, "--no-pictures").returncode == 0
+    start = f"{run}:{[row['point'] for row in read_path(run) if row['label'] == 'fold'][1]}"
+    over, said = f"{KEY}=1.28:1.32:1", list[str]()
+    done = started("boundary", ARCH, "--over", over, "--from", start, "--out", tmp_path / "two", ranks=2)
+    assert done.returncode == 0, done.stderr
+    two = list(csv.DictReader((tmp_path / "two" / "boundary.csv").open()))
+    assert [float(two[i]["key"]) for i in (0, -1)] == [1.28, 1.32]
+
+    def killed(line: str) -> None:
+        said.append(line)
+        if len(said) == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        ms.boundary(ARCH, over, out=tmp_path / "b", say=killed, start=start)
+    kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "b" / "points").glob("*down*.json")}
+    assert kept
+    again = ms.boundary(ARCH, over, out=tmp_path / "b", start=start)
+    assert all(file.stat().st_mtime_ns == then for file, then in kept.items() if file.exists())
+    for row, there in zip(again.rows, two, strict=True):
+        rise = row["key"]
+        assert (row["kind"], row["load"]) == (there["kind"], pytest.approx(float(there["load"]), rel=1e-9))
+        assert row["load"] == pytest.approx(2 * rise - 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3)
 
 
 def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:

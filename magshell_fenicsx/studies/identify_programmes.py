@@ -1,0 +1,430 @@
+"""Another history of the sample, predicted with what an identification has found: runs of the posterior, as bands.
+
+The case is run at the fit, and for parameters drawn from the posterior. Between the quantiles of these runs lie 95 % of
+them; so a snap that comes earlier in some of them makes a wide band there, where slopes would say nothing.
+"""
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.input.tables import TableError, column_size, read_table
+from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, Row, write_csv
+from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.problem.columns import extra_columns, sizes_in_units
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.runs.running import run
+from magshell_fenicsx.studies.identify_data import Parameter, parameters_of
+from magshell_fenicsx.studies.identify_picture import draw_programme
+from magshell_fenicsx.studies.identify_predicted import Predictor
+from magshell_fenicsx.studies.identify_sections import IdentifySection, ProgrammeSection
+from magshell_fenicsx.studies.laplace import RIGHT, Fit
+from magshell_fenicsx.studies.points import identity, value_at
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
+from magshell_fenicsx.studies.runner import (
+    FAILED,
+    Case,
+    Made,
+    Outcome,
+    Say,
+    compute,
+    keep_outcome,
+    kept_outcome,
+    outcome_of,
+)
+
+Array = NDArray[np.float64]
+ENOUGH = 0.9  # of the samples: a place that fewer reach has no band
+NORMAL = float(scipy.stats.norm.ppf((1 + RIGHT) / 2))
+ALWAYS = ("step", "branch", "mode", "amplitude")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A result along a step: its name in the data, its column of path.csv, and the data in the unit of that."""
+
+    header: str
+    of: str
+    data: Array
+    change: bool
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is predicted: as in identify.json, in words, the rows of its table, and what is drawn."""
+
+    name: str
+    content: dict[str, Any]
+    said: list[str]
+    rows: list[dict[str, Any]]
+
+    def write(self, folder: Path) -> None:
+        """Write table and picture."""
+        if self.rows:
+            write_csv(self.rows, list(self.rows[0]), folder / f"identify_{self.name}.csv")
+            draw_programme(self.rows, self.name, self.content["places"], folder / f"identify_{self.name}.png")
+
+
+@dataclass
+class Programme:
+    """A case that is predicted.
+
+    Attributes
+    ----------
+    source
+        The case, with its own settings.
+    places, steps
+        Column of path.csv, what it is at each place of the data, and the steps of these; without data these are all
+        points of the last step.
+    keys
+        Of the runs, that of the fit first; "" where drawn parameters make no case.
+    """
+
+    name: str
+    source: Source
+    samples: int
+    made: Made
+    last: int
+    place: str
+    places: Array | None
+    steps: NDArray[np.int64]
+    columns: list[Column]
+    scalars: list[Scalar]
+    keys: list[str] = field(default_factory=list)
+
+    def compute(self, predictor: Predictor, fit: Fit, say: Say) -> None:
+        """Run the case at the fit and for drawn parameters; collective, and every rank computes runs of its own."""
+        cases = dict[str, Case]()
+        for number, x in enumerate([fit.x, *drawn(fit, self.samples)]):
+            vectors = predictor.folder / "points" / f"{self.name}_{number}.csv"
+            if predictor.field:
+                predictor.comm.Barrier()
+                if predictor.comm.rank == 0:
+                    predictor.write(x, vectors)
+                predictor.comm.Barrier()
+            try:
+                case = self.made(predictor.source_at(predictor.comm.bcast(x), self.source, vectors))
+                case.problem()
+            except CaseError as e:
+                if not number:
+                    raise CaseError(f"identify.predict.{self.name}: at the fit: {e}") from None
+                self.keys.append("")
+                continue
+            self.keys.append(identity(case))
+            cases[self.keys[-1]] = case
+        folder = predictor.folder
+        missing = predictor.comm.bcast([key for key in cases if self._outcome(folder, key) is None])
+        if predictor.comm.rank == 0:
+            say(f"{self.name}: {len(cases)} runs, {len(missing)} to compute")
+
+        def computed(key: str) -> Iterator[str]:
+            outcome = self._run(cases[key])
+            keep_outcome(outcome, cases[key], _file(folder, key))
+            why = f", {outcome.stopped}" if outcome.stopped else ""
+            yield f"{missing.index(key) + 1:5d}/{len(missing)}  {self.name}: {len(outcome.curve)} points{why}"
+
+        compute(missing, computed, predictor.comm, say)
+        predictor.count += len(missing)
+
+    def _run(self, case: Case) -> Outcome:
+        begun = time.perf_counter()
+        try:
+            result = run(case.problem(), comm=MPI.COMM_SELF)
+            outcome = outcome_of(result, "path", result.scene.newton.factorisation.count, columns=COLUMNS)
+        except Exception as e:  # whatever it is, the other runs go on, and the table has no band if many fail
+            outcome = Outcome.failed(" ".join(f"{FAILED}{type(e).__name__}: {e}".split()))
+        curve = [{name: row[name] for name in self._needed if name in row} for row in outcome.curve]
+        return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - begun, 3))
+
+    @property
+    def _needed(self) -> dict[str, None]:
+        own = [self.place, *(each.of for each in self.columns)]
+        names = [*ALWAYS, *own, *(name for each in self.scalars for name in (each.column, each.at))]
+        return dict.fromkeys(name for name in names if name not in ("", "end"))
+
+    def _outcome(self, folder: Path, key: str) -> Outcome | None:
+        """What is known of a run; an error may have been of the machine, and is tried again."""
+        outcome = kept_outcome(_file(folder, key))
+        if outcome is None or (outcome.stopped or "").startswith(FAILED):
+            return None
+        known = not outcome.curve or self._needed.keys() <= outcome.curve[0].keys()
+        return outcome if known else None
+
+    def found(self, folder: Path, fit: Fit, noise: Mapping[str, Mapping[str, Any]]) -> Found:
+        """What the runs say.
+
+        Raises
+        ------
+        CaseError
+            If the run at the fit fails.
+        """
+        outcomes = [kept_outcome(_file(folder, key)) if key else None for key in self.keys]
+        first, drawn_ones = outcomes[0], outcomes[1:]
+        assert first
+        if not first.curve:
+            raise CaseError(f"identify.predict.{self.name}: nothing is predicted at the fit: {first.stopped}")
+        runs = [each for each in drawn_ones if each and each.curve]
+        curves = [_Path(each.curve, self.place) for each in (first, *runs)]
+        places, steps = self.places, self.steps
+        if places is None:
+            places = np.array(curves[0].of(self.last)[0])
+            steps = np.full(places.size, self.last, dtype=np.int64)
+        rows = [
+            row
+            for column in self.columns
+            for row in self._rows(column, places, steps, curves, self._noise(column, noise), len(drawn_ones))
+        ]
+        numbers = {each.name: self._number(each, first, runs, len(drawn_ones)) for each in self.scalars}
+        measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
+        inside = int(sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured))
+        stopped = [each.stopped for each in runs if each.stopped]
+        lost = len(drawn_ones) - len(runs)
+        content = {
+            "samples": len(drawn_ones),
+            "without_path": lost,
+            "stopped_early": len(stopped),
+            "stopped": first.stopped,
+            "places": self.place,
+            "measured": len(measured),
+            "inside": inside,
+            "numbers": numbers,
+        }
+        return Found(self.name, content, self._said(content), rows)
+
+    def _said(self, content: Mapping[str, Any]) -> list[str]:
+        said = []
+        if content["measured"]:
+            said.append(f"{self.name}: {content['inside']} of {content['measured']} data within their predicted bands")
+        for name, each in content["numbers"].items():
+            value = "nothing" if each["value"] is None else f"{each['value']:.6g}"
+            band = f", 95 % between {each['low']:.6g} and {each['high']:.6g}" if each["low"] is not None else ""
+            said.append(f"{self.name}: {name} = {value} predicted{band}, from {each['runs']} runs")
+        if content["stopped"]:
+            said.append(f"warning: {self.name}: at the fit the run stopped early: {content['stopped']}")
+        if count := content["without_path"] + content["stopped_early"]:
+            said.append(f"warning: {self.name}: {count} of {content['samples']} runs are lost or stopped early")
+        return said
+
+    def _noise(self, column: Column, noise: Mapping[str, Mapping[str, Any]]) -> float:
+        """The standard deviation of such a measurement, where the identification knows it."""
+        return next((float(noise[name]["deviation"]) for name in (column.header, column.of) if name in noise), 0.0)
+
+    def _rows(
+        self,
+        column: Column,
+        places: Array,
+        steps: NDArray[np.int64],
+        curves: "Sequence[_Path]",
+        noise: float,
+        samples: int,
+    ) -> Iterator[dict[str, Any]]:
+        values = np.array([curve.at(column, places, steps) for curve in curves])
+        for i, place in enumerate(places):
+            value, band = values[0, i], _band(values[1:, i], samples)
+            low, high = band or (np.nan, np.nan)
+            row = {
+                "step": int(steps[i]),
+                self.place: float(place),
+                "result": column.of,
+                "measured": float(column.data[i]) if column.data.size else np.nan,
+                "predicted": float(value),
+                "low": low,
+                "high": high,
+                "low_measured": value - np.hypot(value - min(low, value), NORMAL * noise) if band else np.nan,
+                "high_measured": value + np.hypot(max(high, value) - value, NORMAL * noise) if band else np.nan,
+            }
+            yield {name: "" if isinstance(v, float) and not np.isfinite(v) else v for name, v in row.items()}
+
+    @staticmethod
+    def _number(scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int) -> dict[str, Any]:
+        values = np.array([np.nan if (v := each.value(scalar)) is None else v for each in runs])
+        band = _band(values, samples)
+        low, high = band or (None, None)
+        return {"value": first.value(scalar), "low": low, "high": high, "runs": int(np.isfinite(values).sum())}
+
+
+class _Path:
+    """The curve of a run, read step by step."""
+
+    def __init__(self, rows: Sequence[Row], place: str) -> None:
+        self._rows = [row for row in rows if row["branch"] == 0 and row["mode"] in OWN_MODES]
+        self._place = place
+
+    def of(self, step: int, column: str = "") -> tuple[list[float], list[float]]:
+        """Places and values of a column in a step, from the point where it begins."""
+        own = [i for i, row in enumerate(self._rows) if row["step"] == step]
+        rows = self._rows[max(own[0] - 1, 0) : own[-1] + 1] if own else []
+        return [float(row[self._place]) for row in rows], [float(row[column or self._place]) for row in rows]
+
+    def at(self, column: Column, places: Array, steps: NDArray[np.int64]) -> Array:
+        """A column at places, where the path first passes each in its step; nan where it does not."""
+        values = np.full(len(places), np.nan)
+        for step in np.unique(steps):
+            x, y = map(np.array, self.of(int(step), column.of))
+            if x.size < 2:
+                continue
+            y = y - y[0] if column.change else y
+            slack = 1e-9 * np.ptp(x)
+            for i in np.flatnonzero(steps == step):
+                low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
+                passed = np.flatnonzero((low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1]))
+                if passed.size:
+                    k = passed[0]
+                    values[i] = y[k] + (y[k + 1] - y[k]) * np.clip((places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1)
+        return values
+
+
+def _band(values: Array, samples: int) -> tuple[float, float] | None:
+    """Between which 95 % of the runs lie; None if too few of them have a value."""
+    values = values[np.isfinite(values)]
+    if values.size < ENOUGH * samples:
+        return None
+    low, high = np.quantile(values, [(1 - RIGHT) / 2, (1 + RIGHT) / 2], method="hazen")
+    return float(low), float(high)
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / "points" / f"{key}.json"
+
+
+def drawn(fit: Fit, count: int) -> Array:
+    """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the bands are."""
+    size = fit.deviation
+    spread, axes = np.linalg.eigh(fit.correlation)
+    spread = np.maximum(spread, 0.0)
+    rng = np.random.default_rng(0)
+    even = [(rng.permutation(count) + 0.5) / count for _ in size]  # Latin hypercube: each axis has its quantiles
+    normal = scipy.stats.norm.ppf(np.transpose(even))
+    wider = fit.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)) / NORMAL
+    return np.asarray(fit.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
+
+
+def programme(
+    name: str, source: Source, parameters: Sequence[Parameter], section: ProgrammeSection, made: Made
+) -> Programme:
+    """What a section asks for; collective.
+
+    Raises
+    ------
+    CaseError
+        If the case or a setting is none, lacks a parameter, or has no such result.
+    """
+    where = f"identify.predict.{name}"
+    base = copy.deepcopy(source)
+    try:
+        if section.case:
+            base = read_source(source.folder / section.case)
+        for setting in section.settings:
+            override(base, setting)
+        for each in ("identify", "ensemble", "design"):
+            base.data.pop(each, None)
+        if lacking := next((p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None):
+            raise CaseError(f"{section.case or 'the case'} has no {lacking}, which is looked for")
+        problem = made(base).problem()
+    except CaseError as e:
+        raise CaseError(f"{where}: {e}") from None
+    names = _Names(problem)
+    last = len(problem.programme)
+    own = names.shown(amplitude(problem.programme[-1].name).column) if last else ""
+    place, columns = own, list[Column]()
+    places: Array | None = None
+    steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+    if section.data:
+        place, places, steps, columns = _measured(source.folder / section.data, names, last, f"{where}.data")
+    there = {each.of for each in columns}
+    for of in section.of:
+        if "@" not in of and of in names.all:
+            shown = names.shown(of)
+            columns += [] if shown in there else [Column(of, shown, np.zeros(0), change=False)]
+    scalars = [_scalar(of, where) for of in section.of if "@" in of or of not in names.all]
+    if columns and not place:
+        raise CaseError(f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown")
+    known = {text for each in columns for text in (each.header, each.of)}
+    if strange := next((of for of in section.changes if of not in known), None):
+        raise CaseError(f"{where}.changes: {strange}: is no column that is predicted; these are {', '.join(known)}")
+    columns = [replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns]
+    return Programme(name, base, section.samples, made, last, place, places, steps, columns, scalars)
+
+
+def refuse_unfit_programmes(source: Source, case: Case, section: IdentifySection, made: Made) -> None:
+    """See that what is to be predicted is there; collective.
+
+    Raises
+    ------
+    CaseError
+        See `programme`.
+    """
+    parameters = parameters_of(source, case, section) if section.predict else ()
+    for name, each in section.predict.items():
+        programme(name, source, parameters, each, made)
+
+
+def _scalar(of: str, where: str) -> Scalar:
+    try:
+        return parse_scalar(of)
+    except CaseError as e:
+        raise CaseError(f"{where}.of: {str(e).removeprefix('--result ')}") from None
+
+
+class _Names:
+    """The columns of path.csv that a case has."""
+
+    def __init__(self, problem: Any) -> None:
+        self.sizes = sizes_in_units(problem)
+        numbers = (name for name in (*COLUMNS, *extra_columns(problem)) if name not in TEXTS)
+        self.all = dict.fromkeys(numbers)
+
+    def shown(self, name: str) -> str:
+        """The column in units of a column, or itself."""
+        there = self.sizes.column(name)
+        return there.name if there else name
+
+    def of(self, name: str, unit: str | None, where: str) -> tuple[str, float]:
+        """The column of a name with a unit, and what one of that unit is in it.
+
+        Raises
+        ------
+        CaseError
+            If there is none, or a unit is missing.
+        """
+        in_units = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
+        if unit is None:
+            if name not in self.all or name in TEXTS:
+                raise CaseError(f"{where}: {name}: is no column of path.csv of this case")
+            if (there := self.shown(name)) != name:
+                raise CaseError(f"{where}: {name}: has no unit: write {name} [{in_units[there]}]")
+            return name, 1.0
+        fitting = [of for of in in_units if of == name or of.startswith(f"{name}_")]
+        for of in sorted(fitting, key=len):
+            try:
+                return of, column_size(name, unit, in_units[of])
+            except TableError as e:
+                raise CaseError(f"{where}: {e}") from None
+        raise CaseError(f"{where}: {name}: has the unit {unit}, but no column of this name has one in this case")
+
+
+def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Array, NDArray[np.int64], list[Column]]:
+    """The place, what it is in each row, the rows' steps, and the columns."""
+    try:
+        columns, units = read_table(file, Files())
+    except TableError as e:
+        raise CaseError(f"{where}: {file.name}: {e}") from None
+    where = f"{where}: {file.name}"
+    given = {header: values for header, values in columns.items() if header != "step"}
+    if len(given) < 2:
+        raise CaseError(f"{where}: needs two columns or more: the place first, then what was measured there")
+    found = [(header, *names.of(header, units[header], where), values) for header, values in given.items()]
+    (_, place, factor, at), *others = found
+    steps = np.asarray(columns.get("step", np.full(at.size, last)))
+    if not (np.isfinite(at).all() and at.size and np.isin(steps, np.arange(1, last + 1)).all()):
+        raise CaseError(f"{where}: a row has no place, or no step of 1 to {last}")
+    return place, at * factor, steps.astype(np.int64), [Column(h, of, v * f, change=False) for h, of, f, v in others]
