@@ -8,13 +8,14 @@ D = dM/du^T G dM/du + L . d2M/du2. Moments go up to larger boxes and L comes dow
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
-from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points
+from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
 
 Array = NDArray[np.float64]
@@ -199,12 +200,17 @@ class ActingOnEachOther:
         -1 of additions to u that are opposite in the images.
     """
 
-    stored: bsr_array
+    near: Stiffness
     far: Far
     B: Array
     scale: float
     cells: Cells
     sign: float
+
+    @cached_property
+    def stored(self) -> bsr_array:
+        """See `assembly.whole.Acting`."""
+        return self.near.matrix(self.sign)
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""

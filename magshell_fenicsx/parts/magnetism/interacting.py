@@ -145,7 +145,7 @@ class InteractionTerm:
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], local, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(stiffness.matrix(sign), far, B, self._scale, cells, sign)
+            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
             for sign in ([1.0, -1.0] if several else [1.0, 1.0])
         )
         return even, odd

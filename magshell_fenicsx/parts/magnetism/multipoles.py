@@ -2,7 +2,7 @@
 
 With R = r^l P_l^m(cos theta) e^(i m phi)/(l + m)! and I = (l - m)! P_l^m(cos theta) e^(i m phi)/r^(l + 1) about centres
 at a distance D from each other, 1/|a - b| is the sum of (-1)^l conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')(D)
-(E. W. Hobson, The Theory of Spherical and Ellipsoidal Harmonics, 1931; L. Greengard, V. Rokhlin, Acta Numerica 6, 1997).
+(L. Greengard, V. Rokhlin, Acta Numerica 6, 1997; M. A. Epton, B. Dembart, SIAM J. Sci. Comput. 16, 1995, 865).
 Real and imaginary parts are taken apart: Y has ORDER + 1 squared numbers. The sum ends with l + l' = ORDER: it is then
 Taylor's polynomial in a - b, so that what two charges do to each other is opposite to rounding.
 """
@@ -92,14 +92,14 @@ def translations(D: Array) -> Array:
     """The matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) . G Y(a), for vectors D (n, 3) from b's centre to a's."""
     x, y, z = D.T
     square, w = x * x + y * y + z * z, x + 1j * y
-    I: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
+    of: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
     for m in range(ORDER + 1):
         if m:
-            I[m, m] = -(2 * m - 1) * w / square * I[m - 1, m - 1]
+            of[m, m] = -(2 * m - 1) * w / square * of[m - 1, m - 1]
         for degree in range(m + 1, ORDER + 1):
-            I[degree, m] = (2 * degree - 1) * z / square * I[degree - 1, m]
+            of[degree, m] = (2 * degree - 1) * z / square * of[degree - 1, m]
             if degree > m + 1:
-                I[degree, m] -= ((degree - 1) ** 2 - m * m) / square * I[degree - 2, m]
+                of[degree, m] -= ((degree - 1) ** 2 - m * m) / square * of[degree - 2, m]
     rows, _ = _complex()
     C, keys = np.array(list(rows.values())).conj(), list(rows)
     G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
@@ -107,7 +107,7 @@ def translations(D: Array) -> Array:
         for j, (l2, m2) in enumerate(keys):
             degree, m = l1 + l2, m1 + m2
             if degree <= ORDER:
-                G[:, j, i] = (-1) ** l1 * (I[degree, m] if m >= 0 else (-1) ** m * I[degree, -m].conj())
+                G[:, j, i] = (-1) ** l1 * (of[degree, m] if m >= 0 else (-1) ** m * of[degree, -m].conj())
     return np.ascontiguousarray((C.T @ G @ C).real)
 
 

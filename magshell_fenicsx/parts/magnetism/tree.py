@@ -11,7 +11,7 @@ from magshell_fenicsx.parts.magnetism.multipoles import COUNT, translations
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-APART = 0.6  # sum of the radii of two boxes over the distance of their middles, up to which multipoles serve
+APART = 0.5  # sum of the radii of two boxes over the distance of their middles, up to which multipoles serve
 CELLS = 4  # in a box of the finest level, about
 DEEPEST = 10
 
