@@ -130,6 +130,8 @@ class Charged:
             self._apart[cell] = 1
             self._apart[cell, others] = 0
         self._parts = parts
+        along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
+        self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))
         self._grid: Grid | None = None
         self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
@@ -154,7 +156,7 @@ class Charged:
 
         They follow from where the cells are, not from where they have been.
         """
-        self._grid = self._grid or Grid(self._places, self._parts, own, itself=self._near is not None)
+        self._grid = self._grid or Grid(self._places, self._parts, self._groups, own, itself=self._near is not None)
         places, radii = _balls(nodes)
         grown = np.maximum(0, np.ceil(np.log(radii / self._radii) / np.log(GROWN) - 0.5)).astype(np.int64)
         key = np.column_stack([self._grid.moved(places), grown])

@@ -230,7 +230,7 @@ def _times(Z: Array, M: Array) -> Array:
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
     """Boxes that are the same of the eight in their parents, and the shift to these."""
-    bits = keys[:, 1:] & 1
+    bits = keys[:, 2:] & 1
     number = bits @ np.array([4, 2, 1])
     for k in map(int, np.unique(number)):
         yield shift((k >> 2, k >> 1 & 1, k & 1)), np.flatnonzero(number == k)

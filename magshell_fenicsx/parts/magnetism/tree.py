@@ -14,6 +14,7 @@ Ints = NDArray[np.int64]
 APART = 0.5  # sum of the radii of two boxes over the distance of their middles, up to which multipoles serve
 CELLS = 4  # in a box of the finest level, about
 DEEPEST = 10
+ROOM = 1.0137  # no simple number: cells of a regular mesh are not on sides of boxes
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Level:
     Attributes
     ----------
     keys
-        (boxes, 4) the part, and the place in the grid.
+        (boxes, 5) the part, the group, and the place in the grid.
     middle
         (boxes, 3)
     of_cell
@@ -72,16 +73,19 @@ class Grid:
         (cells, 3) of the undeformed cells.
     parts
         (cells,) the number of each one's part.
+    groups
+        (cells,) cells of different groups act on each other directly: copies whose boxes are not images of each other.
     own
         The cells of this rank.
     itself
         Whether a part acts on itself, too.
     """
 
-    def __init__(self, places: Array, parts: Ints, own: range, *, itself: bool) -> None:
-        self._places, self._parts, self._own, self._itself = places, parts, own, itself
-        self._origin = places.min(axis=0)
-        self._size = float(np.ptp(places, axis=0).max()) * (1 + 1e-9) or 1.0
+    def __init__(self, places: Array, parts: Ints, groups: Ints, own: range, *, itself: bool) -> None:
+        self._places, self._own, self._itself, self._kinds = places, own, itself, np.column_stack([parts, groups])
+        lowest, highest = places.min(axis=0), places.max(axis=0)
+        self._size = float((highest - lowest).max()) * ROOM or 1.0
+        self._origin = (lowest + highest - self._size) / 2  # a mirror plane of the whole is one of the boxes
         self._depth = 0
         while self._depth < DEEPEST and len(places) > CELLS * len(np.unique(self._keys(places), axis=0)):
             self._depth += 1
@@ -100,12 +104,12 @@ class Grid:
         """The boxes of cells that have moved; `radii` (cells,) contain their charges."""
         places = self._places + self.step * steps
         keys, levels, pairs = self._keys(places), list[Level](), np.zeros((0, 2), dtype=np.int64)
-        grids = [np.column_stack([keys[:, 0], keys[:, 1:] >> (self._depth - k)]) for k in range(self._depth + 1)]
+        grids = [np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)]) for k in range(self._depth + 1)]
         found, before = list[tuple[Ints, Ints, Array, float]](), None
         for k, grid in enumerate(grids):
             boxes, of_cell = np.unique(grid, axis=0, return_inverse=True)
             width = self._size / 2**k
-            found.append((boxes, of_cell.reshape(-1), self._origin + (boxes[:, 1:] + 0.5) * width, width))
+            found.append((boxes, of_cell.reshape(-1), self._origin + (boxes[:, 2:] + 0.5) * width, width))
         offsets: dict[tuple[int, ...], int] = {}
         near = np.zeros((len(self._own), len(places)), dtype=bool)
         for k, (boxes, of_cell, middle, width) in enumerate(found):
@@ -124,9 +128,9 @@ class Grid:
             if not self._itself:
                 pairs = pairs[boxes[pairs[:, 0], 0] != boxes[pairs[:, 1], 0]]
             distance = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=-1)
-            far = radius[pairs].sum(axis=1) < APART * distance
+            far = (radius[pairs].sum(axis=1) < APART * distance) & (boxes[pairs[:, 0], 1] == boxes[pairs[:, 1], 1])
             (one, other), pairs = pairs[far].T, pairs[~far]
-            vectors = [tuple(map(int, each)) for each in boxes[one, 1:] - boxes[other, 1:]]
+            vectors = [tuple(map(int, each)) for each in boxes[one, 2:] - boxes[other, 2:]]
             which = np.array([offsets.setdefault(each, len(offsets)) for each in vectors], dtype=np.int64)
             order = np.argsort(which, kind="stable")
             levels.append(Level(width, boxes, middle, of_cell, parent, one[order], other[order], which[order]))
@@ -139,7 +143,7 @@ class Grid:
 
     def _keys(self, places: Array) -> Ints:
         at = np.floor((places - self._origin) * (2**self._depth / self._size)).astype(np.int64)
-        return np.column_stack([self._parts, at])
+        return np.column_stack([self._kinds, at])
 
     def _translated(self, offsets: list[tuple[int, ...]]) -> Array:
         new = [each for each in offsets if each not in self._translations]
