@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
-LARGEST = 9000  # unknowns: a matrix of 650 MB
+LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
 class InteractionTerm:
