@@ -94,16 +94,17 @@ class Grid:
     @cached_property
     def step(self) -> float:
         """Cells that move by less than half of this stay in their boxes."""
-        return self._size / 2**self._depth / 4
+        return float(self._size / 2**self._depth / 4)
 
     def moved(self, places: Array) -> Ints:
         """How many steps cells have moved: the boxes follow from this alone."""
-        return np.rint((places - self._places) / self.step).astype(np.int64)
+        return np.asarray(np.rint((places - self._places) / self.step), dtype=np.int64)
 
     def tree(self, steps: Ints, radii: Array) -> Tree:
         """The boxes of cells that have moved; `radii` (cells,) contain their charges."""
         places = self._places + self.step * steps
-        keys, levels, pairs = self._keys(places), list[Level](), np.zeros((0, 2), dtype=np.int64)
+        keys, levels = self._keys(places), list[Level]()
+        pairs: Ints = np.zeros((0, 2), dtype=np.int64)
         grids = [np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)]) for k in range(self._depth + 1)]
         found, before = list[tuple[Ints, Ints, Array, float]](), None
         for k, grid in enumerate(grids):
@@ -111,7 +112,6 @@ class Grid:
             width = self._size / 2**k
             found.append((boxes, of_cell.reshape(-1), self._origin + (boxes[:, 2:] + 0.5) * width, width))
         offsets: dict[tuple[int, ...], int] = {}
-        near = np.zeros((len(self._own), len(places)), dtype=bool)
         for k, (boxes, of_cell, middle, width) in enumerate(found):
             own = np.zeros(len(boxes), dtype=bool)
             own[of_cell[self._own.start : self._own.stop]] = True
@@ -138,7 +138,7 @@ class Grid:
         of_cell, count = found[-1][1], len(found[-1][0])
         beside = np.zeros((count, count), dtype=bool)
         beside[pairs[:, 0], pairs[:, 1]] = True
-        near = beside[of_cell[self._own.start : self._own.stop, None], of_cell]
+        near: NDArray[np.bool_] = beside[of_cell[self._own.start : self._own.stop, None], of_cell]
         return Tree(levels, self._translated(list(offsets)), near)
 
     def _keys(self, places: Array) -> Ints:
