@@ -6,8 +6,8 @@ The charges of `charges` stay with the material, so the energy of parts A and B 
 
 and that of a part in its own field half of this, with both in A: functions of the displacement by the places alone.
 Forces and stiffness are their derivatives, exact for the rule. Cells far from each other act by multipoles (`far`).
-Each other pair of cells has a Gauss rule whose error is below `PRECISION` at their distance (`rate`), the same for both;
-for those that touch see `near`.
+Each other pair of cells has a Gauss rule whose error is below `PRECISION` at their distance (`rate`), the same for
+both; for those that touch see `near`.
 """
 
 from itertools import product
