@@ -1,7 +1,7 @@
 """Terms whose tangent has entries outside the pattern of the others: between some unknowns, or between all of them.
 
 The couplings of contact change from state to state: their entries are added to a copy of the sparse matrix. Where all
-unknowns act on each other dense rows stand beside it (`assembly.whole.WholeMatrix`).
+unknowns act on each other, the rest stands beside it (`assembly.whole.WholeMatrix`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ def of_all(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.Di
 
 @dataclass(frozen=True)
 class OfAll:
-    """Those of terms in which all unknowns act on each other: dense rows beside the sparse tangent."""
+    """Those of terms in which all unknowns act on each other: what stands beside the sparse tangent."""
 
     matrix: WholeMatrix
     terms: Sequence[WholeTerm]

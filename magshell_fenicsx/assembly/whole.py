@@ -1,52 +1,88 @@
-"""The tangent of a system in which all unknowns act on each other: the sparse matrix and dense rows.
+"""The tangent of a system in which all unknowns act on each other: the sparse matrix and what stands beside it.
 
-Both are kept apart, as factors of the sparse one mostly serve (`continuation.beside`). Their sum is one of PETSc with
-all entries, of which factors, inertia, folds and modes are those of any system. Its memory and its factors grow
-with the square and the cube of the number of unknowns.
+What a term adds is stored between nodes that are near each other, and known by its products with vectors between
+others. Of what is stored, the entries that the sparse matrix has too are added to it: the rest is then small beside
+it, and factors of the sparse one mostly serve (`continuation.beside`). The sum is a matrix of PETSc with all entries,
+of which factors, inertia, folds and modes are those of any system. Its memory and its factors grow with the square
+and the cube of the number of unknowns.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.sparse import bsr_array, csr_array
 
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.continuation.system import Beside, Vector
 
 Array = NDArray[np.float64]
+COLUMNS = 128  # for which products are computed at once where all entries are needed
+
+
+class Acting(Protocol):
+    """This rank's part of a second derivative, without supports; it does not change.
+
+    Attributes
+    ----------
+    stored
+        (3 local nodes with ghosts, 3 all nodes) the blocks between nodes near each other, each row's columns in order.
+    """
+
+    @property
+    def stored(self) -> bsr_array: ...
+
+    def times_others(self, v: Array) -> Array:
+        """The product (3 local nodes, n) of all other entries with the same changes (3 all nodes, n) on every rank."""
 
 
 @runtime_checkable
 class WholeTerm(Term, Protocol):
     """A term whose tangent couples nodes that share no cell and no edge."""
 
-    def rows(self, *, rough: bool = False) -> Array:
-        """This rank's part of d2Pi/du2, without supports, (local nodes with ghosts, 3, all nodes, 3). Collective.
-
-        Nobody writes into it. If `rough`, it may be that of an earlier state.
-        """
+    def acting(self, *, rough: bool = False) -> Acting:
+        """d2Pi/du2; if `rough`, it may be that of an earlier state. Collective."""
 
 
 @dataclass(frozen=True)
-class Dense:
+class OfTerm:
+    """A second derivative times a factor.
+
+    Attributes
+    ----------
+    stored
+        What is stored of this rank's own unknowns.
+    left_out
+        Entries that are not counted.
+    """
+
+    factor: float
+    stored: bsr_array
+    acting: Acting
+    left_out: csr_array | None = None
+
+
+@dataclass(frozen=True)
+class Rows:
     """Terms times factors, without the rows and columns of supports: a `continuation.system.Rest`."""
 
     matrix: "WholeMatrix"
-    parts: Sequence[tuple[float, Array]]  # factors, and this rank's rows (own unknowns, all)
+    parts: Sequence[OfTerm]
 
     def times(self, v: Vector) -> Vector:
         """See `Rest`."""
         own, everywhere = self.matrix.held
         whole = np.where(everywhere, 0.0, np.concatenate(self.matrix.comm.allgather(v)))
-        return np.where(own, 0.0, sum(factor * (rows @ whole) for factor, rows in self.parts))
+        return np.where(own, 0.0, self.matrix.product(self.parts, whole))
 
-    def scaled(self, factor: float) -> "Dense":
+    def scaled(self, factor: float) -> "Rows":
         """See `Rest`."""
-        return Dense(self.matrix, [(factor * each, rows) for each, rows in self.parts])
+        return Rows(self.matrix, [replace(part, factor=factor * part.factor) for part in self.parts])
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         """See `Rest`."""
@@ -75,7 +111,7 @@ class WholeMatrix:
             held[dofs[dofs < n]] = True
         self.comm, self.held = comm, (held, np.concatenate(comm.allgather(held)))
         self._whole: tuple[Array, Array, PETSc.Mat] | None = None
-        self._summed: dict[str, tuple[Array, Array]] = {}
+        self._stored: dict[str, tuple[Acting, bsr_array]] = {}
 
     def _made(self) -> tuple[Array, Array, PETSc.Mat]:
         """The entries in columns of own nodes and in others, which the third, their matrix, shares."""
@@ -96,17 +132,27 @@ class WholeMatrix:
         return inner, outer, K
 
     def beside(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]], *, rough: bool = False) -> Beside:
-        """A sparse matrix and terms times factors beside it. Collective."""
-        return Beside(K, Dense(self, [(factor, self.rows(term, rough=rough)) for factor, term in terms]))
+        """A sparse matrix, to which its own entries of terms times factors are added, and the rest. Collective."""
+        starts, columns, values = K.getValuesCSR()
+        rows, kept = np.repeat(np.arange(len(starts) - 1), np.diff(starts)), list[OfTerm]()
+        free = ~(self.held[0][rows] | self.held[1][columns])
+        whole = [self.of_term(factor, term, rough=rough) for factor, term in terms]
+        for part in whole:
+            given = np.where(free, _entries(part.stored, rows, columns), 0.0)
+            values += part.factor * given
+            kept.append(replace(part, left_out=csr_array((given, columns, starts), part.stored.shape)))
+        K.setValuesCSR(starts, columns, values)
+        K.assemble()
+        return Beside(K, Rows(self, kept), Rows(self, whole))
 
-    def sum(self, K: PETSc.Mat, parts: Sequence[tuple[float, Array]]) -> PETSc.Mat:
-        """A sparse matrix plus rows times factors. Collective."""
+    def sum(self, K: PETSc.Mat, parts: Sequence[OfTerm]) -> PETSc.Mat:
+        """A sparse matrix plus terms times factors. Collective."""
         n, first, (own, everywhere) = 3 * self._owned, 3 * self._first, self.held
         self._whole = inner, outer, matrix = self._whole or self._made()
         rows = inner if self.comm.size == 1 else np.empty((n, 3 * self._count))  # nothing is copied
         rows[:] = 0.0
-        for factor, part in parts:
-            rows += factor * part
+        for part in parts:
+            rows += part.factor * self._all(part)
         rows[own], rows[:, everywhere] = 0.0, 0.0
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
@@ -116,25 +162,80 @@ class WholeMatrix:
         matrix.stateIncrease()
         return matrix
 
-    def rows(self, term: WholeTerm, *, rough: bool = False) -> Array:
-        """The rows (own unknowns, all) of a term, summed over the ranks, supports too. Collective."""
-        parts, (summed_before, summed) = term.rows(rough=rough), self._summed.get(term.name, (None, np.empty(0)))
-        if summed_before is not parts:
-            summed = self._own(parts).reshape(3 * self._owned, -1)
-            self._summed[term.name] = parts, summed
-        return summed
+    def of_term(self, factor: float, term: WholeTerm, *, rough: bool = False) -> OfTerm:
+        """A term, what it stores summed over the ranks. Collective."""
+        acting, (before, stored) = term.acting(rough=rough), self._stored.get(term.name, (None, None))
+        if before is not acting or stored is None:
+            stored = self._own_blocks(acting.stored)
+            self._stored[term.name] = acting, stored
+        return OfTerm(factor, stored, acting)
+
+    def rows(self, term: WholeTerm) -> Array:
+        """The rows (own unknowns, all) of a term, supports too. Collective."""
+        return self._all(self.of_term(1.0, term))
+
+    def product(self, parts: Sequence[OfTerm], whole: Array) -> Array:
+        """Terms times factors, supports too, with changes of all unknowns; of own unknowns. Collective."""
+        found = np.zeros(3 * self._owned)
+        for part in parts:
+            others = part.acting.times_others(whole[:, None]).reshape(-1, 3)
+            found += part.factor * (part.stored @ whole + self._own(others).ravel())
+            if part.left_out is not None:
+                found -= part.factor * (part.left_out @ whole)
+        return found
 
     def times(self, terms: Sequence[tuple[float, WholeTerm]], v: Array) -> Array:
-        """This rank's part of the terms' product with a vector, both with ghosts. Collective."""
-        whole = np.concatenate(self.comm.allgather(v[: 3 * self._owned]))
-        return np.asarray(sum(factor * (term.rows().reshape(len(v), -1) @ whole) for factor, term in terms))
+        """The terms' product with a vector, both with ghosts, which are zero in the product. Collective."""
+        whole, product = np.concatenate(self.comm.allgather(v[: 3 * self._owned])), np.zeros_like(v)
+        product[: 3 * self._owned] = self.product([self.of_term(factor, term) for factor, term in terms], whole)
+        return product
+
+    def _all(self, part: OfTerm) -> Array:
+        """All entries of own rows, without the factor."""
+        rows = part.stored.toarray() - (0.0 if part.left_out is None else part.left_out.toarray())
+        for first in range(0, 3 * self._count, COLUMNS):
+            some = np.eye(3 * self._count, min(COLUMNS, 3 * self._count - first), -first)
+            others = part.acting.times_others(some)
+            rows[:, first : first + COLUMNS] += self._own(others.reshape(-1, 3, some.shape[1])).reshape(len(rows), -1)
+        return np.asarray(rows)
 
     def _own(self, rows: Array) -> Array:
-        """The rows of own nodes, summed over the ranks."""
+        """The rows (local nodes, ..) of own nodes, summed over the ranks."""
         if self.comm.size == 1:
             return rows
         own, ghosts = rows[: self._owned].copy(), rows[self._owned :]
-        leaving = [np.flatnonzero(self._owners == rank) for rank in range(self.comm.size)]
-        for numbers, part in self.comm.alltoall([(self._numbers[i], ghosts[i]) for i in leaving]):
+        for numbers, part in self.comm.alltoall([(self._numbers[i], ghosts[i]) for i in self._leaving]):
             np.add.at(own, numbers - self._first, part)
         return own
+
+    def _own_blocks(self, rows: bsr_array) -> bsr_array:
+        """The rows of own unknowns, summed over the ranks."""
+        if self.comm.size == 1:
+            return rows
+        n = 3 * self._owned
+        own, ghosts, sent = rows.tocsr()[:n], rows.tocsr()[n:].tocoo(), list[tuple[NDArray[np.generic], ...]]()
+        for nodes in self._leaving:
+            leaves = np.isin(ghosts.row // 3, nodes)
+            row = 3 * self._numbers[ghosts.row[leaves] // 3] + ghosts.row[leaves] % 3
+            sent.append((row, ghosts.col[leaves], ghosts.data[leaves]))
+        for row, column, data in self.comm.alltoall(sent):
+            own = own + csr_array((data, (row - 3 * self._first, column)), own.shape)
+        blocks = own.tobsr((3, 3))
+        blocks.sort_indices()
+        return blocks
+
+    @cached_property
+    def _leaving(self) -> list[NDArray[np.intp]]:
+        """The ghosts of each rank, counted from the first ghost."""
+        return [np.flatnonzero(self._owners == rank) for rank in range(self.comm.size)]
+
+
+def _entries(stored: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """Entries of a matrix of blocks whose columns are in order; zero where there is no block."""
+    width, count = stored.shape[1] // 3, len(stored.indptr) - 1
+    keys = np.repeat(np.arange(count, dtype=np.int64), np.diff(stored.indptr)) * width + stored.indices
+    wanted = rows.astype(np.int64) // 3 * width + columns // 3
+    if not len(keys):
+        return np.zeros(len(wanted))
+    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[at] == wanted, stored.data[at, rows % 3, columns % 3], 0.0)

@@ -109,3 +109,14 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
                 x = apart(x)
                 out.append(x / np.sqrt(dot(comm, x, x)))
     return None
+
+
+def largest(times: Map, first: Vector, comm: MPI.Comm) -> float:
+    """The largest magnitude of an eigenvalue of A, to about `SURE`; infinite if it is not found."""
+    krylov = Krylov(times, first, comm, MOST)
+    while (size := krylov.grow()) < MOST:
+        values, vectors = np.linalg.eig(krylov.H[:size, :size])
+        i = int(np.argmax(np.abs(values)))
+        if size >= LEAST and abs(krylov.H[size, size - 1] * vectors[-1, i]) <= SURE * abs(values[i]):
+            return float(abs(values[i]))
+    return np.inf

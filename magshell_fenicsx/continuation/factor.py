@@ -12,7 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import crossings, solved
+from magshell_fenicsx.continuation.beside import crossings, largest, solved
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -48,8 +48,8 @@ class Factorisation:
     skewed
         Whether that tangent was a skewed one.
     doubt
-        Where K was factored in place of K + D, the inverse of the error of D, relative to it, with which the pivots'
-        signs would still be certain; else infinite.
+        Where K was factored in place of K + D, the inverse of the error of D, or of what may be of an earlier state,
+        relative to it, with which the pivots' signs would still be certain; else infinite.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -136,6 +136,9 @@ class Factorisation:
             self._waiting = PATIENT
             return False
         self._rest, (more, self.doubt) = tangent.D, counted
+        if (changing := tangent.changing) is not None:
+            of_all = largest(lambda v: self._back(changing.times(v)), self._back(np.asarray(noise)), self.comm)
+            self.doubt = max(self.doubt, of_all)
         self.negative_pivots += more
         return True
 

@@ -107,14 +107,15 @@ class BorderedNewton:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
         If the latest factors belong to a state near by, they are used, and the tangent is refined with
-        differences of the residual; `exact` factors K at the solution itself.
+        differences of the residual, and so is one from factors with a part of an earlier state; `exact` factors K at
+        the solution itself.
         """
         comm, near = self.system.comm, self._tangents.state
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
-        matrix = self._bordered(near if fresh and near else state, name, row)
+        matrix = self._bordered(near if fresh and near else state, name, row, rough=not exact)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
-        if moved and fresh:
+        if not exact and ((moved and fresh) or self._tangents.rough):
             refined = refined_tangent(self.system, matrix, tangent, state, load, row)
             if refined is None:
                 return self.response(state, name, row, exact=True)
@@ -123,12 +124,12 @@ class BorderedNewton:
         softness = -dot(comm, load, du) / dmu - self.system.curvature(state.u, state.mu, name, name)
         return Response(du, dmu, softness, self.factorisation.negative_pivots)
 
-    def _bordered(self, state: State, name: str, row: Row) -> Bordered:
+    def _bordered(self, state: State, name: str, row: Row, *, rough: bool) -> Bordered:
         """The bordered matrix at a state; the one of the last solve if it has the same state and row."""
-        last = self._linear.matrix
-        if last and last.row is row and last.state is state is self._tangents.state:  # the same object, not only equal
+        last, serves = self._linear.matrix, rough or not self._tangents.rough
+        if last and serves and last.row is row and last.state is state is self._tangents.state:  # the same object
             return last
-        return Bordered(self.system, self.factor_at(state), state, name, row)
+        return Bordered(self.system, self._tangents.at(state, rough=rough), state, name, row)
 
 
 @dataclass

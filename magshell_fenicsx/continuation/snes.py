@@ -90,7 +90,7 @@ class Tangents:
         self.system, self._factorisation = system, factorisation
         self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and its number
         self._stressed = False  # whether it was factored with another stress than its own
-        self._rough = False  # whether a small part of it is that of an earlier state
+        self.rough = False  # whether a small part of it is that of an earlier state
 
     @property
     def state(self) -> State | None:
@@ -102,9 +102,9 @@ class Tangents:
         """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state."""
         near, factors = self.state, self._factorisation
         other = near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm))
-        if other or (self._rough and not rough):
-            self._rough = rough and factored_roughly(self.system, factors, state, stress)
-            if not self._rough:
+        if other or (self.rough and not rough):
+            self.rough = rough and factored_roughly(self.system, factors, state, stress)
+            if not self.rough:
                 factors.factor(self.system.tangent(state.u, state.mu, stress))
             self._made, self._stressed = (state, factors.count), bool(stress)
         return factors

@@ -30,10 +30,17 @@ class Rest(Protocol):
 
 @dataclass(frozen=True)
 class Beside:
-    """The symmetric matrix K + D, with all entries: K sparse, D mostly small beside it."""
+    """The symmetric matrix K + D, with all entries: K sparse, D mostly small beside it.
+
+    Attributes
+    ----------
+    changing
+        What may be that of an earlier state: D and its part in K; D alone if None.
+    """
 
     K: PETSc.Mat
     D: Rest
+    changing: Rest | None = None
 
 
 @dataclass(frozen=True)

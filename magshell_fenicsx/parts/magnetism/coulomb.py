@@ -5,8 +5,9 @@ The charges of `charges` stay with the material, so the energy of parts A and B 
     W = sum of q_i q_j/|x_i - x_j|, i in A, j in B,    x = r + zeta n,
 
 and that of a part in its own field half of this, with both in A: functions of the displacement by the places alone.
-Forces and stiffness are their derivatives, exact for the rule. Each pair of cells has a Gauss rule whose error is below
-`PRECISION` at their distance (`degree`), the same for both; for those that touch see `near`.
+Forces and stiffness are their derivatives, exact for the rule. Cells far from each other act by multipoles (`far`).
+Each other pair of cells has a Gauss rule whose error is below `PRECISION` at their distance (`rate`), the same for
+both; for those that touch see `near`.
 """
 
 from itertools import product
@@ -19,15 +20,20 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.tree import Grid
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-DEGREES = (3, 5, 7, 10, 14, 20, 30)  # of the rules on triangles that there are
+DEGREES = (4, 5, 6, 8, 10, 14, 20, 30)  # of the rules on triangles that there are
+FAR = 2  # the rule for multipoles
+GROWN = 1.25  # the radius of a cell counts as a power of this times that of the undeformed cell
 PRECISION = 1e-5  # of a pair of cells at their distance
 BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
+FLAT = 0.3  # sine of the angle up to which a cell is beside another: the pole is then beyond the ellipse's end
 SPACE = 1e-3  # of cells that touch, over their size
 
 
@@ -124,6 +130,12 @@ class Charged:
         for cell, others in enumerate(near.touching if near else ()):
             self._apart[cell] = 1
             self._apart[cell, others] = 0
+        self._parts = parts
+        along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
+        self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
+        self._places, self._radii = _balls(copies.of(shape.r0))
+        self._grid: Grid | None = None
+        self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
 
     def rules(self, nodes: Array, own: range) -> NDArray[np.int8]:
         """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that has none here.
@@ -134,11 +146,26 @@ class Charged:
             If two parts are closer than their thickness.
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
-        apart = np.ascontiguousarray(self._apart[own.start : own.stop])
-        rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, worst=worst)
+        apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
+        rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
         if rules is None:
             raise Touching
         return rules
+
+    def boxes(self, nodes: Array, own: range) -> tuple[Far, NDArray[np.bool_]]:
+        """Cells far from each other by boxes, and the pairs (own, copies * cells) that are too near for that.
+
+        They follow from where the cells are, not from where they have been.
+        """
+        self._grid = self._grid or Grid(self._places, self._parts, self._groups, own, itself=self._near is not None)
+        places, radii = _balls(nodes)
+        grown = np.maximum(0, np.ceil(np.log(radii / self._radii) / np.log(GROWN) - 0.5)).astype(np.int64)
+        key = np.column_stack([self._grid.moved(places), grown])
+        if self._boxes is None or not np.array_equal(key, self._boxes[0]):
+            tree = self._grid.tree(key[:, :3], self._radii * GROWN ** key[:, 3] + self._h / 2)
+            kinds = [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
+            self._boxes = key, Far(tree, kinds, own, self._pairs), tree.near
+        return self._boxes[1:]
 
     def evaluate(self, nodes: Array, own: range, stiffness: Stiffness | None = None) -> tuple[float, Array]:
         """The energy of the pairs that own cells are in, each half, and its gradient (own, k, 3) by their nodes.
@@ -155,7 +182,9 @@ class Charged:
         Touching
             See `rules`.
         """
-        rules, gradient, energy = self.rules(nodes, own), np.zeros_like(nodes), 0.0
+        rules, gradient = self.rules(nodes, own), np.zeros_like(nodes)
+        far = self.boxes(nodes, own)[0]
+        energy = far.add(far.placed(nodes), bent=stiffness is not None)
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own.start
         both_own = (second >= own.start) & (second < own.stop)  # such a pair stands in both orders
@@ -169,10 +198,16 @@ class Charged:
                 left, right = (one.rule(int(number)), one_row[charged]), (other.rule(int(number)), other_row[charged])
                 count = int(charged.sum())
                 energy += share * self._pairs.add(nodes, cells[charged], count, left, right, gradient, stiffness)
-        for number, kind in product(np.unique(which), self._kinds):
+        for number, kind in product({FAR, *np.unique(which)}, self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:
             energy += self._near.add(nodes, gradient, stiffness)
         if stiffness:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
+
+
+def _balls(nodes: Array) -> tuple[Array, Array]:
+    """Middles (cells, 3) and radii of cells with nodes (cells, k, 3)."""
+    middle = nodes.mean(axis=1)
+    return middle, np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)

@@ -16,6 +16,7 @@ from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
+from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
-LARGEST = 9000  # unknowns: a matrix of 650 MB
+LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
 class InteractionTerm:
@@ -60,7 +61,7 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
-        self._stiff: tuple[Array, tuple[Array, Array]] | None = None  # deformed nodes and rows, also of odd additions
+        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther]] | None = None  # and its deformed nodes
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""
@@ -108,21 +109,21 @@ class InteractionTerm:
         """A sum over pairs of charges."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """It has no sparse part; see `rows`."""
+        """Nodes far apart act on each other; see `acting`."""
 
-    def rows(self, *, rough: bool = False) -> Array:
+    def acting(self, *, rough: bool = False) -> "ActingOnEachOther":
         """See `assembly.whole.WholeTerm`; collective."""
-        return self._even.both_rows(rough=rough)[1] if self._even else self.both_rows(rough=rough)[0]
+        return self._even.both(rough=rough)[1] if self._even else self.both(rough=rough)[0]
 
-    def both_rows(self, *, rough: bool) -> tuple[Array, Array]:
-        """The rows, and those of additions to u that are opposite in the images; collective."""
+    def both(self, *, rough: bool) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
+        """The second derivative, and that by additions to u that are opposite in the images; collective."""
         nodes = self._nodes()
         if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
             self._stiff = None  # two are not kept at once
-            self._stiff = nodes, self._rows_at(nodes)
+            self._stiff = nodes, self._acting_at(nodes)
         return self._stiff[1]
 
-    def _rows_at(self, nodes: Array) -> tuple[Array, Array]:
+    def _acting_at(self, nodes: Array) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
         own, images, V = self._cells.own, self._copies.images, self._u.function_space
         count, several = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
@@ -131,15 +132,23 @@ class InteractionTerm:
         row_of[own.start : own.stop] = V.dofmap.list[: len(own)]
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
-        rows = np.zeros((local, 3, count * (1 + several), 3))
+        far, near = self._charged.boxes(nodes, own)
+        beside = np.zeros((local, count), dtype=bool)
+        for cell, row in zip(own, near, strict=True):
+            columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
+            beside[row_of[cell][:, None], columns] = True
+        stiffness = Stiffness(beside, self._scale, row_of, column_of, turn)
         try:
-            self._charged.evaluate(nodes, own, Stiffness(rows, self._scale, row_of, column_of, turn))
+            self._charged.evaluate(nodes, own, stiffness)
         except Touching:
-            rows[:] = np.nan
-        if not several:
-            return rows, rows
-        here, there = rows[:, :, :count], rows[:, :, count:]
-        return here + there, here - there
+            stiffness.blocks[:] = np.nan
+        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], local, turn)
+        B = far.jacobian(far.placed(nodes))
+        even, odd = (
+            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
+            for sign in ([1.0, -1.0] if several else [1.0, 1.0])
+        )
+        return even, odd
 
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by the nodes of own cells; collective."""

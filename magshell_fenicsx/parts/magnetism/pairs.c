@@ -191,15 +191,15 @@ INLINE void sum_up(const Point *p, int bent, int64_t idle, const int64_t *at, in
    sL (rows, P, SUMS). On the second are M points for each of these, TR (P, M, 3, k), hR (P, M, S), tR (rows, P, M),
    qR (rows, P, M, S), eR; their derivatives are added to gradient (cells, k, 3) and `onto`, see `own`. Or `same` ones
    for all: without the axis P, and added to sR (rows, M, SUMS). Unless `onto` is NULL, second derivatives by the nodes of
-   both cells times `factor` are added to rows (.., 3, columns, 3), in the row row_of (cells, k) if that is not negative,
-   and the column column_of (cells, k) of the node that a copy is the image of by turn (copies, 3, 3); each copy has
-   `modelled` cells. */
+   both cells times `factor` are added to blocks (.., 3, 3), to that with the number in `where` (rows, columns): in the row
+   row_of (cells, k) if that is not negative, and the column column_of (cells, k) of the node that a copy is the image of
+   by turn (copies, 3, 3); each copy has `modelled` cells. */
 FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *both, int64_t nodes_of_cell,
                   const double *nodes, int64_t P, int64_t L, const double *TL, const double *hL, const double *tL,
                   const double *qL, double *sL, const int64_t *eL, int64_t M, int64_t S, const double *TR,
                   const double *hR, const double *tR, const double *qR, double *sR, const int64_t *eR, int64_t same,
-                  double *gradient, double factor, double *onto, double *rows, int64_t columns, const int64_t *row_of,
-                  const int64_t *column_of, const double *turn, int64_t modelled)
+                  double *gradient, double factor, double *onto, double *blocks, const int32_t *where, int64_t columns,
+                  const int64_t *row_of, const int64_t *column_of, const double *turn, int64_t modelled)
 {
     const int k = (int)nodes_of_cell, half = 9 * k * (k + 1) / 2, bent = onto != 0;
     const int64_t all = same ? M : P * M;
@@ -308,11 +308,11 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                             h[i][j] = factor * HX[(3 * l + i) * 3 * k + j * k + m][c];
                     for (int i = 0; i < 3 && a >= 0; ++i)
                         for (int j = 0; j < 3; ++j)
-                            rows[((3 * a + i) * columns + j0) * 3 + j] +=
+                            blocks[9 * where[a * columns + j0] + 3 * i + j] +=
                                 h[i][0] * second[j] + h[i][1] * second[3 + j] + h[i][2] * second[6 + j];
                     for (int j = 0; j < 3 && b >= 0; ++j)
                         for (int i = 0; i < 3; ++i)
-                            rows[((3 * b + j) * columns + i0) * 3 + i] +=
+                            blocks[9 * where[b * columns + i0] + 3 * j + i] +=
                                 h[0][j] * first[i] + h[1][j] * first[3 + i] + h[2][j] * first[6 + i];
                 }
         }
@@ -358,7 +358,7 @@ FAST void points(int64_t count, int64_t idle, const int64_t *cells, int64_t node
    near each other, within h or with a rate below `worst`. */
 FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const double *nodes, const double *centre,
                    const double *normal, const double *radius, const uint8_t *apart, double h, double space,
-                   double above, int64_t count, const double *least, double worst, int8_t *found)
+                   double above, double flat, int64_t count, const double *least, double worst, int8_t *found)
 {
     for (int64_t c = first; c < last; ++c)
         for (int64_t d = 0; d < n; ++d) {
@@ -394,10 +394,37 @@ FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const doub
             const double rate = fmax(gap / size, space);
             if (!(rate >= worst))
                 return 1;
+            double up = 0.0, down = 0.0, square = 0.0;
+            for (int i = 0; i < 3; ++i) {
+                up += between[i] * normal[3 * c + i], down += between[i] * normal[3 * d + i];
+                square += between[i] * between[i];
+            }
+            const double seen = fmax(up * up, down * down) < flat * flat * square ? sqrt(rate * (1.0 + rate)) : rate;
             int64_t which = 0;
-            while (which < count - 1 && rate < least[which])
+            while (which < count - 1 && seen < least[which])
                 ++which;
             *to = (int8_t)which;
         }
     return 0;
+}
+
+/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., n of M, n of L), of which in each row the first
+   `ends` (n,) are not zero, M and L (boxes, n, width). */
+FAST void translate(int64_t count, const int64_t *one, const int64_t *other, const int64_t *which, int64_t n,
+                    const int64_t *ends, int64_t width, const double *G, const double *M, double *L)
+{
+    for (int64_t at = 0; at < count; ++at) {
+        const double *m = M + other[at] * n * width;
+        double *l = L + one[at] * n * width;
+        for (int64_t j = 0; j < n; ++j) {
+            const double *g = G + (which[at] * n + j) * n, x = m[j * width];
+            if (width == 1)
+                for (int64_t i = 0; i < ends[j]; ++i)
+                    l[i] += g[i] * x;
+            else
+                for (int64_t i = 0; i < ends[j]; ++i)
+                    for (int64_t k = 0; k < width; ++k)
+                        l[i * width + k] += g[i] * m[j * width + k];
+        }
+    }
 }

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.sparse import bsr_array
 
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.platform.native import native
@@ -19,13 +20,15 @@ FUNCTIONS = """
     double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *,
         const double *, const double *, const double *, double *, const int64_t *, int64_t, int64_t, const double *,
         const double *, const double *, const double *, double *, const int64_t *, int64_t, double *, double, double *,
-        double *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
+        double *, const int32_t *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
     void points(int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, const double *, const double *,
         double *, double *);
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
-        const uint8_t *, double, double, double, int64_t, const double *, double, int8_t *);
+        const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
+    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
+        const double *, const double *, double *);
 """
-KINDS = {"float64": "double[]", "int64": "int64_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
+KINDS = {"float64": "double[]", "int64": "int64_t[]", "int32": "int32_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
 
 
 @dataclass(frozen=True)
@@ -94,22 +97,35 @@ class Points:
 
 
 class Stiffness:
-    """Second derivatives, added to rows of a matrix; those by the nodes of one cell are first summed for each cell.
+    """Second derivatives, added to blocks of a matrix; those by the nodes of one cell are first summed for each cell.
 
     Parameters
     ----------
-    rows
-        (local nodes, 3, all nodes, 3), added to.
+    beside
+        (local nodes, all nodes) which blocks there are.
     factor
         Of all second derivatives.
     row_of, column_of
-        (cells, k) numbers of nodes; rows of other ranks and of images are -1.
+        (cells, k) numbers of nodes; rows of other ranks and of images are -1, columns of images follow all others.
     turn
         (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
+
+    Attributes
+    ----------
+    blocks
+        (n, 3, 3) row by row, added to; then those of images.
     """
 
-    def __init__(self, rows: Array, factor: float, row_of: Ints, column_of: Ints, turn: Array) -> None:
-        self.rows, self.factor, self.row_of, self.column_of = rows, factor, row_of, column_of
+    def __init__(self, beside: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array) -> None:
+        self.factor, self.row_of, self.column_of = factor, row_of, column_of
+        number = np.where(beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1).astype(np.int32)
+        self._count = int(np.count_nonzero(beside))
+        self._columns = np.nonzero(beside)[1]
+        self._starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))])
+        self._shape = 3 * beside.shape[0], 3 * beside.shape[1]
+        of_images = [number + self._count] if len(turn) > 1 else []
+        self.where = np.concatenate([number, *of_images], axis=1)
+        self.blocks = np.zeros((self._count * (1 + len(of_images)), 3, 3))
         self.turn = np.ascontiguousarray(turn)
         cells, k = row_of.shape
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
@@ -122,8 +138,12 @@ class Stiffness:
         for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
             onto = self.factor * self.onto[cell]
             block[b, a], block[a, b] = onto.transpose(0, 2, 1), onto
-            at = self.row_of[cell][:, None], slice(None), self.column_of[cell][None], slice(None)
-            self.rows[at] += block
+            self.blocks[self.where[self.row_of[cell][:, None], self.column_of[cell]]] += block
+
+    def matrix(self, sign: float) -> bsr_array:
+        """(3 local nodes, 3 all nodes), with the columns of images times the sign."""
+        here, there = self.blocks[: self._count], self.blocks[self._count :]
+        return bsr_array((here + sign * there if len(there) else here, self._columns, self._starts), self._shape)
 
 
 class Pairs:
@@ -157,11 +177,12 @@ class Pairs:
         both, left_rows, right_rows = (_filled(rows, idle) for rows in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        matrix = [self._ffi.NULL, self._ffi.NULL, 0, self._ffi.NULL, self._ffi.NULL, self._ffi.NULL, 1]
+        matrix = [*3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
         if stiffness:
-            onto, rows, width = stiffness.onto, stiffness.rows, stiffness.rows.shape[2]
+            onto, blocks, where = stiffness.onto, stiffness.blocks, stiffness.where
             turn, modelled = stiffness.turn, len(nodes) // len(stiffness.turn)
-            matrix = [p(onto), p(rows), width, p(stiffness.row_of), p(stiffness.column_of), p(turn), modelled]
+            nodes_of = p(stiffness.row_of), p(stiffness.column_of)
+            matrix = [p(onto), p(blocks), p(where), where.shape[1], *nodes_of, p(turn), modelled]
         on_left, on_right = ([p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0]))
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
         factor = stiffness.factor if stiffness else 0.0
@@ -190,6 +211,7 @@ class Pairs:
         h: float,
         space: float,
         above: float,
+        flat: float,
         worst: float,
     ) -> NDArray[np.int8] | None:
         """(own, cells) the number of the rule of each pair, -1 without one; None if two cells are too near each other.
@@ -206,6 +228,8 @@ class Pairs:
             Least distance over size that is counted.
         above
             Part of a cell's radius: what is so near to its middle is above or below the cell.
+        flat
+            Sine of the angle up to which a cell is beside another, not above it.
         worst
             As `least`, of the rule beyond the last: cells below it are too near.
         """
@@ -216,8 +240,23 @@ class Pairs:
         p, chosen = self._pointer, np.empty((len(own), len(nodes)), dtype=np.int8)
         sizes = [len(nodes), own.start, own.stop, nodes.shape[1]]
         arrays = [p(array) for array in (nodes, centre, normal, radius, apart)]
-        too_near = self._lib.rules(*sizes, *arrays, h, space, above, len(least), p(least), worst, p(chosen))
+        too_near = self._lib.rules(*sizes, *arrays, h, space, above, flat, len(least), p(least), worst, p(chosen))
         return None if too_near else chosen
+
+    def translate(self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array) -> None:
+        """Add G (.., of M, of L) number `which` times M of boxes `other` to L (boxes, .., n) of boxes `one`.
+
+        Parameters
+        ----------
+        ends
+            How many of each row of G are not zero.
+        """
+        p, arrays = self._pointer, [np.ascontiguousarray(each) for each in (G, M)]
+        if len(one):
+            numbers = [p(each) for each in (one, other, which)]
+            self._lib.translate(
+                len(one), *numbers, M.shape[1], p(ends), M.shape[2], *(p(each) for each in arrays), p(L)
+            )
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous

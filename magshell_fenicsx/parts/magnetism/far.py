@@ -1,0 +1,236 @@
+"""The energy of charges far from each other, by multipoles of boxes of cells (the fast multipole method).
+
+The moments M of the charges in a box about its middle, which does not move, are polynomials of their places, and the
+energy is a quadratic form of them, E = sum of M_A . G_AB M_B/2 over boxes far from each other, with constant G. So
+forces and stiffness are its derivatives, without any sum over pairs of charges: those by the moments are L = G M, and
+D = dM/du^T G dM/du + L . d2M/du2. Moments go up to larger boxes and L comes down, so the cost grows like n.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import bsr_array
+
+from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
+from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.tree import Tree
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in pairs.c
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Places, normals and dual bases (rows, P, 3) of points on the mid-surface."""
+
+    r: Array
+    n: Array
+    up: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, nodes: Array, tables: Array) -> "Surface":
+        r, a1, a2 = np.tensordot(nodes, tables, axes=(1, 2)).transpose(3, 0, 2, 1)
+        m = np.cross(a1, a2)
+        size = np.linalg.norm(m, axis=-1, keepdims=True)
+        n = m / size
+        return cls(r, n, (np.cross(a2, n) / size, np.cross(n, a1) / size))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Charges where they are.
+
+    Attributes
+    ----------
+    Y
+        (COUNT, charges) harmonics about the middles of their boxes, over their width; in the order of boxes.
+    surfaces
+        Of each kind.
+    heights
+        (rows, P, L) over the mid-surface, of each kind.
+    """
+
+    Y: Array
+    surfaces: list[Surface]
+    heights: list[Array]
+
+
+class Far:
+    """The sum over pairs of boxes of a tree, for the charges of some kinds of elements.
+
+    Parameters
+    ----------
+    kinds
+        Cells (rows,) and points of each.
+    own
+        The cells of this rank.
+    """
+
+    def __init__(self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own: range, pairs: Pairs) -> None:
+        self._tree, self._kinds, self._pairs, self._leaf = tree, kinds, pairs, tree.levels[-1]
+        self._own = [(cells >= own.start) & (cells < own.stop) for cells, _ in kinds]
+        box = np.concatenate([self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds])
+        self._order = np.argsort(box, kind="stable")
+        self._filled, self._first = np.unique(box[self._order], return_index=True)
+        self._middle = self._leaf.middle[box[self._order]]
+        self._q = np.concatenate([points.q.ravel() for _, points in kinds])[self._order]
+
+    def placed(self, nodes: Array) -> Placed:
+        """The charges on cells with nodes (cells, k, 3)."""
+        surfaces = [Surface.of(nodes[cells], points.tables) for cells, points in self._kinds]
+        heights = [points.t[..., None] * points.heights for _, points in self._kinds]
+        both = zip(surfaces, heights, strict=True)
+        x = [(s.r[:, :, None] + z[..., None] * s.n[:, :, None]).reshape(-1, 3) for s, z in both]
+        return Placed(harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width), surfaces, heights)
+
+    def add(self, at: Placed, *, bent: bool) -> float:
+        """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go to points' sums."""
+        M = np.zeros((len(self._leaf.keys), COUNT, 1))
+        M[self._filled, :, 0] = np.add.reduceat(self._q * at.Y, self._first, axis=1).T
+        N, L = derivatives(), self.onto(M)[..., 0]
+        slopes = [*N, *(N[i] @ N[j] for i, j in SECOND)] if bent else N
+        of_box = np.stack([L, *(L @ each for each in slopes)], axis=-1)
+        values = np.empty((len(self._q), of_box.shape[-1]))
+        for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
+            values[self._order[first:end]] = at.Y[:, first:end].T @ of_box[box]
+        values *= self._leaf.width ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
+        energy, start = 0.0, 0
+        for (_, points), z, own in zip(self._kinds, at.heights, self._own, strict=True):
+            stop = start + points.q.size
+            each = points.q[own, ..., None] * values[start:stop].reshape(*points.q.shape, -1)[own]
+            z, start, energy = z[own, ..., None], stop, energy + each[..., 0].sum() / 2
+            f, K = each[..., 1:4], each[..., 4:]
+            parts = [f, z * f, *([K, z * K, z * z * K] if bent else [])]
+            sums = np.concatenate([part.sum(axis=2) for part in parts], axis=-1)
+            points.sums[own, :, : sums.shape[-1]] += sums
+        return float(energy)
+
+    def onto(self, M: Array) -> Array:
+        """L = G M times the width, of the boxes (boxes, COUNT, n) of the finest level."""
+        levels, moments = self._tree.levels, [M]
+        for level, larger in zip(levels[:0:-1], levels[-2::-1], strict=True):
+            up = np.zeros((len(larger.keys), *M.shape[1:]))
+            for Z, boxes in _octants(level.keys):
+                up[level.parent[boxes]] += _times(Z, moments[0][boxes])
+            moments.insert(0, up)
+        L = np.zeros_like(moments[0])
+        for k, (level, of_level) in enumerate(zip(levels, moments, strict=True)):
+            if k:
+                down = np.empty_like(of_level)
+                for Z, boxes in _octants(level.keys):
+                    down[boxes] = _times(Z.T, L[level.parent[boxes]]) / 2  # over half the width
+                L = down
+            self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
+        return L
+
+    def between(self, moments: Array) -> tuple[Ints, Array]:
+        """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
+        M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
+        np.add.at(M, self._leaf.of_cell, moments)
+        return self._leaf.of_cell, self.onto(M) / self._leaf.width
+
+    def jacobian(self, at: Placed) -> Array:
+        """(cells, COUNT, 3 k) derivatives of the moments of each cell's box by its nodes."""
+        N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
+        B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
+        slopes = np.empty((3, len(self._q), COUNT))
+        for i in range(3):
+            slopes[i, self._order] = (self._q * (N[i] @ at.Y)).T / self._leaf.width
+        for (cells, points), z, surface in zip(self._kinds, at.heights, at.surfaces, strict=True):
+            stop, T = start + points.q.size, points.tables
+            each, start = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT), stop
+            B[cells] += np.einsum("pk,irpa->raki", T[:, 0], each.sum(axis=3), optimize=True)
+            turned = np.einsum("rpl,irpla->irpa", z, each, optimize=True)
+            for d in range(2):
+                along = np.einsum("rpi,irpa->rpa", surface.up[d], turned, optimize=True)
+                B[cells] -= np.einsum("pk,rpi,rpa->raki", T[:, 1 + d], surface.n, along, optimize=True)
+        return B.reshape(len(B), COUNT, 3 * k)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Nodes of cells.
+
+    Attributes
+    ----------
+    nodes
+        (cells, k) global numbers, of what is modelled.
+    own
+        The cells of this rank.
+    rows
+        (own cells, k) local numbers.
+    local
+        Number of local nodes.
+    turn
+        (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
+    """
+
+    nodes: NDArray[np.intp]
+    own: range
+    rows: Ints
+    local: int
+    turn: Array
+
+    def of_copies(self, v: Array, sign: float) -> Array:
+        """Changes (3 nodes, n) as those of the nodes of all copies' cells (copies * cells, 3 k, n)."""
+        n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
+        each = [sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)]
+        return np.concatenate([x[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n) for x in each])
+
+    def summed(self, f: Array) -> Array:
+        """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
+        found = np.zeros((self.local, 3, f.shape[-1]))
+        np.add.at(found, self.rows, f.reshape(*self.rows.shape, 3, -1))
+        return found.reshape(3 * self.local, -1)
+
+
+@dataclass(frozen=True)
+class ActingOnEachOther:
+    """Second derivatives of the energy of all charges: an `assembly.whole.Acting`.
+
+    Attributes
+    ----------
+    B
+        See `Far.jacobian`.
+    sign
+        -1 of additions to u that are opposite in the images.
+    """
+
+    near: Stiffness
+    far: Far
+    B: Array
+    scale: float
+    cells: Cells
+    sign: float
+
+    @cached_property
+    def stored(self) -> bsr_array:
+        """See `assembly.whole.Acting`."""
+        return self.near.matrix(self.sign)
+
+    def times_others(self, v: Array) -> Array:
+        """See `assembly.whole.Acting`."""
+        here = slice(self.cells.own.start, self.cells.own.stop)
+        of_cell, onto = self.far.between(_each(self.B, self.cells.of_copies(v, self.sign)))
+        return self.scale * self.cells.summed(_each(self.B[here].transpose(0, 2, 1), onto[of_cell[here]]))
+
+
+def _each(B: Array, v: Array) -> Array:
+    """Products of matrices (cells, m, n) with columns (cells, n, columns)."""
+    return np.asarray(np.einsum("cmn,cn->cm", B, v[..., 0])[..., None] if v.shape[-1] == 1 else B @ v)
+
+
+def _times(Z: Array, M: Array) -> Array:
+    return np.tensordot(M, Z, axes=(1, 1)).swapaxes(1, 2)
+
+
+def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
+    """Boxes that are the same of the eight in their parents, and the shift to these."""
+    bits = keys[:, 2:] & 1
+    number = bits @ np.array([4, 2, 1])
+    for k in map(int, np.unique(number)):
+        yield shift((k >> 2, k >> 1 & 1, k & 1)), np.flatnonzero(number == k)

@@ -1,0 +1,116 @@
+"""Solid harmonics: what charges in a box are to others far away, and how that is shifted, derived and translated.
+
+With R = r^l P_l^m(cos theta) e^(i m phi)/(l + m)! and I = (l - m)! P_l^m(cos theta) e^(i m phi)/r^(l + 1) about centres
+at a distance D from each other, 1/|a - b| is the sum of (-1)^l conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')(D)
+(L. Greengard, V. Rokhlin, Acta Numerica 6, 1997; M. A. Epton, B. Dembart, SIAM J. Sci. Comput. 16, 1995, 865).
+Real and imaginary parts are taken apart: Y has ORDER + 1 squared numbers. The sum ends with l + l' = ORDER: it is then
+Taylor's polynomial in a - b, so that what two charges do to each other is opposite to rounding.
+"""
+
+from functools import cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+ORDER = 7
+COUNT = (ORDER + 1) ** 2
+
+
+def place_of(degree: int, m: int) -> int:
+    """Of the real part of R_l^m in Y; the imaginary one, for m > 0, is the next."""
+    return degree**2 + max(0, 2 * m - 1)
+
+
+def harmonics(x: Array) -> Array:
+    """Y (COUNT, n) at places (n, 3)."""
+    (a, b, z), Y = np.ascontiguousarray(x.T), np.empty((COUNT, len(x)))
+    square = a * a + b * b + z * z
+    Y[0] = 1.0
+    for m in range(ORDER + 1):
+        if m:
+            before, at = place_of(m - 1, m - 1), place_of(m, m)
+            if m == 1:
+                Y[at], Y[at + 1] = -a / 2, -b / 2
+            else:
+                Y[at] = (b * Y[before + 1] - a * Y[before]) / (2 * m)
+                Y[at + 1] = -(a * Y[before + 1] + b * Y[before]) / (2 * m)
+        for degree in range(m + 1, ORDER + 1):
+            share = 1 / ((degree + m) * (degree - m))
+            for part in range(1 + (m > 0)):
+                at, one, two = (place_of(degree - k, m) + part for k in range(3))
+                np.multiply(z, Y[one], out=Y[at])
+                Y[at] *= (2 * degree - 1) * share
+                if degree > m + 1:
+                    Y[at] -= share * square * Y[two]
+    return Y
+
+
+@cache
+def derivatives() -> tuple[Array, Array, Array]:
+    """The matrices N with dY/dx_i = N_i Y."""
+    found = [np.zeros((COUNT, COUNT)) for _ in range(3)]
+    along, rest = _complex()
+    for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
+        if m > degree:
+            continue
+        # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz R_(l-1)^m
+        up, down, same = (along.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
+        for i, row in enumerate(((up - down) / 2, (up + down) / 2j, same)):
+            at = place_of(degree, m)
+            found[i][at] = row.real
+            if m:
+                found[i][at + 1] = row.imag
+    return found[0], found[1], found[2]
+
+
+def _complex() -> tuple[dict[tuple[int, int], NDArray[np.complex128]], NDArray[np.complex128]]:
+    """R_l^m as rows of coefficients of Y, for all l and m; and a row of zeros."""
+    rows = {}
+    for degree in range(ORDER + 1):
+        for m in range(degree + 1):
+            row = np.zeros(COUNT, dtype=np.complex128)
+            row[place_of(degree, m)] = 1.0
+            if m:
+                row[place_of(degree, m) + 1] = 1j
+                rows[degree, -m] = (-1) ** m * row.conj()
+            rows[degree, m] = row
+    return rows, np.zeros(COUNT, dtype=np.complex128)
+
+
+@cache
+def shift(octant: tuple[int, int, int]) -> Array:
+    """The matrix Z with Y(y/2 + s) = Z Y(y): from the middle of a box to that of the one of which it is this octant."""
+    y = np.random.default_rng(0).uniform(-1, 1, (4 * COUNT, 3))
+    s = (np.array(octant) - 0.5) / 2
+    return np.asarray(np.linalg.lstsq(harmonics(y).T, harmonics(y / 2 + s).T, rcond=None)[0].T)
+
+
+def translations(D: Array) -> Array:
+    """The matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) . G Y(a), for vectors D (n, 3) from b's centre to a's."""
+    x, y, z = D.T
+    square, w = x * x + y * y + z * z, x + 1j * y
+    of: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
+    for m in range(ORDER + 1):
+        if m:
+            of[m, m] = -(2 * m - 1) * w / square * of[m - 1, m - 1]
+        for degree in range(m + 1, ORDER + 1):
+            of[degree, m] = (2 * degree - 1) * z / square * of[degree - 1, m]
+            if degree > m + 1:
+                of[degree, m] -= ((degree - 1) ** 2 - m * m) / square * of[degree - 2, m]
+    rows, _ = _complex()
+    C, keys = np.array(list(rows.values())).conj(), list(rows)
+    G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
+    for i, (l1, m1) in enumerate(keys):
+        for j, (l2, m2) in enumerate(keys):
+            degree, m = l1 + l2, m1 + m2
+            if degree <= ORDER:
+                G[:, j, i] = (-1) ** l1 * (of[degree, m] if m >= 0 else (-1) ** m * of[degree, -m].conj())
+    return np.ascontiguousarray((C.T @ G @ C).real)
+
+
+def ends() -> Ints:
+    """(COUNT,) how many of the first rows of a column of these matrices are not zero."""
+    return np.concatenate([np.full(2 * degree + 1, (ORDER - degree + 1) ** 2) for degree in range(ORDER + 1)])
