@@ -27,7 +27,9 @@ CELL = 0.5  # area of the reference cell
 NOTHING = 1e-12  # an area in it that is none
 LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
 SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
+CLOSE = 1e-9  # between corners that are one
 NOBODY = -1  # the cell that a part of a cell faces where none is
+ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
 FINE = 60  # parts of a side, at whose ends the distance from a rule's points is measured
 DIGITS = 6  # bytes of the number of a state: a float has all of them
 
@@ -103,8 +105,9 @@ class Pieces:
         """What is left of lines from a (n, 2) to b."""
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         left = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
+        left[np.abs(left) < NOTHING] = 0.0
         after, to = np.roll(left, -1, axis=1), np.roll(self.corners, -1, axis=1)
-        crossed = (left < 0) != (after < 0)
+        crossed = left * after < 0
         part = left / np.where(crossed, left - after, 1.0)
         count, m = left.shape
         ends = np.stack([self.corners, self.corners + part[..., None] * (to - self.corners)], axis=2)
@@ -129,6 +132,15 @@ def covers(X: Array) -> float:
     lattice = np.array([(i, j) for i in range(FINE + 1) for j in range(FINE + 1 - i)]) / FINE
     equal = np.array([[1.0, 0.0], [0.5, np.sqrt(3) / 2]])
     return float(np.linalg.norm((lattice[:, None] - X) @ equal, axis=2).min(axis=1).max()) + 1 / FINE
+
+
+def centroid(corners: Array) -> Array:
+    """(n, 2) of polygons that have an area."""
+    at = corners - corners[:, :1]
+    after = np.roll(at, -1, 1)
+    twice = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
+    inner = np.einsum("nk,nki->ni", twice, at + after) / (3 * twice.sum(axis=1))[:, None]
+    return np.asarray(corners[:, 0] + inner)
 
 
 class Segments:
@@ -174,15 +186,26 @@ class Segments:
             return rule
         keys = np.unique(rule.cell[near.point] * number + near.cell)
         one, other = keys // number, keys % number
+        order = np.argsort(self._corners(self._r0, other).mean(axis=1) @ ALONG, kind="stable")
+        one, other = one[order], other[order]
         pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
-        fans = [self._on(pieces, k) for k in range(1, pieces.corners.shape[1] - 1)]
+        fans = [self._on(pieces, k) for k in range(pieces.corners.shape[1])]
         parts = [rule.of(~np.isin(rule.cell, one)), *(each for fan in fans for each in fan)]
         return Points(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("cell", "shape", "weight", "faces")))
 
     def _on(self, pieces: Pieces, k: int) -> list[Points]:
-        """The points on the triangles of the first corner and those with the numbers k and k + 1."""
-        first, made = pieces.corners[:, 0], list[Points]()
-        e1, e2 = pieces.corners[:, k] - first, pieces.corners[:, k + 1] - first
+        """The points on the triangles of the centroids and the corners k and k + 1; a triangle is one by itself.
+
+        So they do not depend on which corner is the first.
+        """
+        corners, made = pieces.corners, list[Points]()
+        apart = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2) > CLOSE
+        three = apart.sum(axis=1) == 3
+        others = np.argsort(~apart, axis=1, kind="stable")[:, :3]
+        own = np.take_along_axis(corners, others[..., None], axis=1)
+        first = np.where(three[:, None], own[:, 0], centroid(corners))
+        e1, e2 = corners[:, k] - first, np.roll(corners, -1, axis=1)[:, k] - first
+        e1[three], e2[three] = (own[three, 1] - first[three], own[three, 2] - first[three]) if k == 0 else (0.0, 0.0)
         size = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
         large = size > 2 * LARGE
         for (X, weights), these in zip(self._rules, (large, ~large & (size > NOTHING)), strict=True):
@@ -198,16 +221,15 @@ class Segments:
         return np.asarray(np.einsum("ck,nki->nci", self._at_corners, r[self._cells.nodes[cell]]))
 
     def _projected(self, one: Longs, other: Longs, r: Array) -> Array:
-        """The corners (n, 3, 2) of cells in reference cells of others, along the normals of these; from the left."""
+        """The corners (n, 3, 2) of cells in reference cells of others, along the normals of these."""
         c, y = self._corners(r, one), self._corners(r, other)
         sides = np.stack([c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]], axis=1)
         X = (y - c[:, :1]) @ np.linalg.pinv(sides)
         coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
         coordinates[np.abs(coordinates) < SNAP] = 0.0
         X = np.asarray((coordinates / coordinates.sum(axis=2, keepdims=True))[..., 1:])
-        right = area(X) < 0
-        X[right] = X[right][:, ::-1]
-        return X
+        level = np.argsort(self._corners(self._r0, other) @ ALONG, axis=1)
+        return np.take_along_axis(X, level[..., None], axis=1)
 
 
 class Cuts:
@@ -242,17 +264,24 @@ class Cuts:
         return number
 
 
+def sides_of(triangles: Array) -> tuple[Array, Array]:
+    """The ends (n, 3, 2) of the sides of triangles, which have these on their left."""
+    a, b = triangles, np.roll(triangles, -1, axis=1)
+    right = (area(triangles) < 0)[:, None, None]
+    return np.where(right, b, a), np.where(right, a, b)
+
+
 def cut_along(triangles: Pieces) -> Pieces:
     """Reference cells cut along the sides of triangles that they face.
 
     Where these neither overlap nor leave a part of the cell, the pieces are what the cell has in common with each.
     """
     cells, number = np.unique(triangles.cell, return_inverse=True)
-    a, b = triangles.corners, np.roll(triangles.corners, -1, axis=1)
+    a, b = sides_of(triangles.corners)
     common = Pieces.cells(triangles.cell).facing(triangles.faces)
     for k in range(3):
         common = common.cut(a[:, k], b[:, k])
-    met = (area(triangles.corners) > NOTHING) & (area(common.corners) > NOTHING)
+    met = (np.abs(area(triangles.corners)) > NOTHING) & (area(common.corners) > NOTHING)
     common, number = common.of(met), number[met]
     total = np.bincount(number, area(common.corners), len(cells))
     part = np.abs(total - CELL) > NOTHING
@@ -276,7 +305,7 @@ def _one_by_one(triangles: Pieces, cells: Longs) -> tuple[Pieces, Pieces]:
         at = np.searchsorted(cells, rest.cell)
         has = number[at] > turn
         by = triangles.of(first[at[has]] + turn)
-        asked, a, b = rest.of(has), by.corners, np.roll(by.corners, -1, axis=1)
+        asked, (a, b) = rest.of(has), sides_of(by.corners)
         common = asked.facing(by.faces)
         for k in range(3):
             common = common.cut(a[:, k], b[:, k])
