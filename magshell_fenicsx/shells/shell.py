@@ -286,7 +286,8 @@ class ShellModel(Thin):
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        stiffnesses |= dict(each.history for each in self.touchings)
+        for each in self.touchings:
+            stiffnesses |= each.history
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses
         )

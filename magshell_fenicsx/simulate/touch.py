@@ -77,6 +77,19 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
     return State(low.state.u, {**low.state.mu, **raised}) if raised else None
 
 
+def recut(stage: Stage, low: Point, high: Point) -> State | None:
+    """The state of the first of two points with the cuts of shells along each other's cells at the second one.
+
+    None if these would not be much better.
+    """
+    if not stage.scene.model.touchings:
+        return None
+    at = stage.scene.model.system.at(stage.leave(high.state))
+    numbers = {each.pair.cuts: at.of(each.recut) for each in stage.scene.model.touchings}
+    changed = {name: number for name, number in numbers.items() if number is not None}
+    return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+
 def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
     """The pairs of shells that may touch, with their penetrations over R; collective."""
     at = scene.model.system.at(state)

@@ -16,7 +16,7 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
-from magshell_fenicsx.simulate.touch import refuse_crossing, refuse_passing, refuse_return, stiffer
+from magshell_fenicsx.simulate.touch import recut, refuse_crossing, refuse_passing, refuse_return, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
@@ -58,14 +58,14 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
-    """A walk on which bodies become stiffer; a magnet between two points ends it, and a body that goes back."""
+    """A walk on which bodies become stiffer and shells are cut anew; magnets on the way and returning bodies end it."""
 
     def checked(low: Point, high: Point) -> State | None:
         refuse_crossing(stage, low, high)
         refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
-        return stiffer(stage, low, high)
+        return stiffer(stage, low, high) or recut(stage, low, high)
 
     walk = Walk(path, start, goal, checked)  # which `checked` looks at
     return walk

@@ -52,9 +52,18 @@ def flattened(half: float, tilt: float, noise: float = 0.0, seed: int = 0) -> Ar
 
 @pytest.mark.parametrize("seed", range(3))
 def test_derivatives(seed: int) -> None:
-    """Central differences of the energy and of the forces at a rough state, some points open: 1e-6."""
+    """Central differences of the energy and of the forces at a rough state, some points open: 1e-6.
+
+    With the first number the cuts are those of the undeformed ring, of which no place faces another; with the others
+    cells are cut where the walls have slid along each other.
+    """
     system, h, mu = ring().model.system, ring().model.material.h, ring().unloaded().mu
     u, term = flattened(0.497, 0.02, 0.002, seed), touching()
+    if seed:
+        r = ring().model.r0.x.array.reshape(-1, 3)
+        slid = u.reshape(-1, 3) + 0.7 * seed * h * np.outer(np.tanh(r[:, 1] / 0.2), [1, 0, 0])
+        mu = mu | {term.pair.cuts: system.at(State(slid.ravel(), mu)).of(term.recut)}
+        assert system.at(State(u, mu)).of(lambda: len(term._pressed()[0].point)) > 2000
     v = system.held(1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size))
     at = system.at(State(u, mu))
     entries = at.of(term.entries)
@@ -95,10 +104,10 @@ def test_nearest_places() -> None:
     """Against a search over a fine lattice of all cells that are not beside a point."""
     model, term = ring().model, touching()
     at = model.system.at(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
-    h, cells, points = model.material.h, term._cells, term._points
+    h, cells, points = model.material.h, term._cells, term._rule
     places = at.of(lambda: term._found(term._now(), 4 * h))
     r = at.of(lambda: term._r0 + term._now())
-    x, n = term._x(r), 40
+    x, n = term._x(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
     inner = np.flatnonzero(np.abs(x[places.point, 0]) < 0.4)

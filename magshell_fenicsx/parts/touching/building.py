@@ -11,7 +11,8 @@ from magshell_fenicsx.assembly.connected import CellsOfAll, whole
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
-from magshell_fenicsx.parts.touching.touching import Points, Touching
+from magshell_fenicsx.parts.touching.segments import NOBODY, Points, Segments
+from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
@@ -58,13 +59,14 @@ def touchings(
     table = element.tabulate(1, X)[..., 0]
     placed = whole(r0)
     a1, a2 = np.einsum("dqk,nki->dnqi", table[1:], placed[nodes])
-    points = Points(
+    rule = Points(
         np.repeat(first + np.arange(count), len(X)),
         np.tile(table[0], (count, 1)),
         (weights * np.linalg.norm(np.cross(a1, a2), axis=2)).ravel(),
-        first,
-        count + topology.index_map(2).num_ghosts,
+        np.full(count * len(X), NOBODY),
     )
+    segments = Segments(cells, rule, X, weights, placed, element.degree)
+    local = first, count + topology.index_map(2).num_ghosts
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     made = list[Touching]()
@@ -76,7 +78,7 @@ def touchings(
 
         own = 3 * index.local_range[0], 3 * index.size_local
         own_h = pair.thickness * h
-        touching = Touching(pair, cells, points, allowed, own_h, placed, lambda: whole(u), own, comm)
+        touching = Touching(pair, cells, rule, segments, allowed, own_h, placed, lambda: whole(u), own, local, comm)
         deep, place = touching.deepest()
         if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)

@@ -55,6 +55,11 @@ class Pair:
         return f"stiffness between {self.names[0]} and {self.names[1]}"
 
     @property
+    def cuts(self) -> str:
+        """Name in a state of the number of the displacement at which its cells were cut along each other."""
+        return f"cuts between {self.names[0]} and {self.names[1]}"
+
+    @property
     def words(self) -> str:
         """What it is, in messages."""
         return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)

@@ -2,7 +2,8 @@
 
 Each mid-surface has points of a quadrature. The gap of a point x is |x - y| - h with the nearest place y of the other
 mid-surface: the faces are half a thickness from both. Both surfaces have points, so that each has half of the penalty.
-A gap is a function of the state alone, and has no side: see `through` for steps that would pass through.
+A gap is a function of the state alone, and has no side: see `through` for steps that would pass through. The points are
+those of a rule on each cell; where cells face others, they are on parts that each face one of them, see `segments`.
 
 With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
 
@@ -37,6 +38,7 @@ from magshell_fenicsx.parts.touching.nearest import (
 )
 from magshell_fenicsx.parts.touching.nearest import project as projected
 from magshell_fenicsx.parts.touching.section import Pair
+from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
@@ -46,6 +48,7 @@ MANY = 100_000  # pairs of a point and a cell at a time
 CHUNK = 1000  # blocks of a tangent at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `Joined`
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
+ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
 PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
 
@@ -57,42 +60,23 @@ class Number:
     value: float
 
 
-@dataclass(frozen=True)
-class Points:
-    """The points of this rank at which gaps are measured.
-
-    Attributes
-    ----------
-    cell
-        (n,) global number.
-    shape
-        (n, functions) of that cell.
-    weight
-        (n,) undeformed area over R^2.
-    first, local
-        Number of the first cell of this rank, and how many it has with ghosts.
-    """
-
-    cell: Longs
-    shape: Array
-    weight: Array
-    first: int
-    local: int
-
-
 class Touching:
     """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
 
     Parameters
     ----------
+    rule
+        Points on all cells of this rank.
+    segments
+        Gives the points where cells face others.
     allowed
         Whether points of cells (n,) may touch cells (n,).
     h
         Thickness over R.
     r0, u
         All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
-    first, own
-        Number of the first degree of freedom of this rank, and how many it has.
+    own, local
+        Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
     """
 
     amplitude = None
@@ -102,31 +86,34 @@ class Touching:
         self,
         pair: Pair,
         cells: Cells,
-        points: Points,
+        rule: Points,
+        segments: Segments,
         allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
         h: float,
         r0: Array,
         u: Callable[[], Array],
         own: tuple[int, int],
+        local: tuple[int, int],
         comm: MPI.Comm,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
-        self.stiffness = Number(pair.stiffness)
-        self._cells, self._points, self._allowed, self._h = cells, points, allowed, h
-        self._r0, self._u, self._own, self._comm = r0, u, own, comm
+        self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
+        self._cells, self._rule, self._segments, self._allowed, self._h = cells, rule, segments, allowed, h
+        self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._beside = cells.near_in_surface(r0, BESIDE * h)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
-        self._places = _none()
+        self._cuts = Cuts(segments, self._near, r0)
+        self._points, self._places = rule, _none()
         self._joined = Joined.of(self._places, 1.0)
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     # as a term
 
     @property
-    def history(self) -> tuple[str, tuple[Number, float]]:
-        """See `FiniteElementSystem`."""
-        return self.pair.setting, (self.stiffness, self.pair.stiffness)
+    def history(self) -> dict[str, tuple[Number, float]]:
+        """See `FiniteElementSystem`; without a number of its own, a state has the cuts of the undeformed surfaces."""
+        return {self.pair.setting: (self.stiffness, self.pair.stiffness), self.pair.cuts: (self.cuts, 0.0)}
 
     def compile_residual(self) -> None:
         """It has no forms."""
@@ -191,7 +178,8 @@ class Touching:
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
-        places = self._found(self._now(), REACH * self._h)
+        self._pressed()
+        places = self._found(self._now(), REACH * self._h, self._points)
         least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
         return least - self._h if np.isfinite(least) else np.nan
 
@@ -206,7 +194,7 @@ class Touching:
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
-            x = self._x(self._r0 + self._now())[at.point[worst]]
+            x = self._x(self._points, self._r0 + self._now())[at.point[worst]]
             mine = (float(self._h - at.distance[worst]), x)
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
@@ -217,13 +205,13 @@ class Touching:
         Of ghosts the pressure is zero and the gap the reach. Collective.
         """
         at, joined, (_, first, _) = self._pressed()
-        points, start = self._points, self._points.first
-        weight, p, gap = np.ones(points.local), np.zeros(points.local), np.full(points.local, (REACH - 1) * self._h)
+        points, (start, count) = self._points, self._local
+        weight, p, gap = np.ones(count), np.zeros(count), np.full(count, (REACH - 1) * self._h)
         np.add.at(weight, points.cell - start, points.weight)
         weight[: len(np.unique(points.cell))] -= 1.0
         pressed = at.point[joined.first]
         np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
-        near = self._found(self._now(), REACH * self._h)
+        near = self._found(self._now(), REACH * self._h, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
@@ -243,21 +231,53 @@ class Touching:
                 return True
         return False
 
+    # its history
+
+    def recut(self) -> float | None:
+        """The number of the present displacement, if cuts there are better than those of the state; collective.
+
+        The measure is the part of the force on points that do not face what they faced where the cuts were made.
+        """
+        u = self._now()
+        at, joined, (_, pressures, _) = self._pressed()
+        astray = self._astray(self._points, at.of(joined.first), pressures)
+        if astray <= ASTRAY:
+            return None
+        points = self._cuts.at(u)
+        places = self._found(u, self._h, points)
+        nearest = places.of(Joined.of(places, BLUR * self._h).first)
+        pressures = penalty(self._h - nearest.distance, self.stiffness.value, SOFT * self._h)[1]
+        return self._cuts.numbered(u) if self._astray(points, nearest, pressures) < astray / 2 else None
+
+    def _astray(self, points: Points, at: Places, pressures: Array) -> float:
+        force = points.weight[at.point] * pressures
+        other = points.faces[at.point] != at.cell
+        whole, part = self._comm.allreduce(np.array([force.sum(), force[other].sum()]))
+        return float(part / whole) if whole else 0.0
+
+    def _near(self, u: Array) -> Places:
+        """The places in all cells that may press on cells of this rank at a displacement."""
+        far = self._h + self._segments.within
+        i, j = self._near_cells(u, float(far.max()))
+        near = self._places_in(self._rule, i, j, self._r0 + u, float(far.max()))
+        return near.of(near.distance < far[self._rule.cell[near.point]])
+
     # geometry
 
     def _now(self) -> Array:
         return self._u()
 
-    def _x(self, r: Array) -> Array:
-        points = self._points
+    def _x(self, points: Points, r: Array) -> Array:
         return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
 
     def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
         u = self._now()
-        if not np.array_equal(u, self._at):
-            self._places, self._at = self._found(u, (1 + SAME) * self._h), np.array(u)
+        points = self._cuts.points(self.cuts.value, u)
+        if points is not self._points or not np.array_equal(u, self._at):
+            self._points = points
+            self._places, self._at = self._found(u, (1 + SAME) * self._h, points), np.array(u)
             self._joined = Joined.of(self._places, BLUR * self._h)
         joined = self._joined
         return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
@@ -347,16 +367,20 @@ class Touching:
         margin = reach + MARGIN * float(radii.mean())
         i, j = self._fit(*near_pairs(centres, radii, margin))
         mine = np.zeros(len(centres), dtype=bool)
-        mine[self._points.cell] = True
+        mine[self._rule.cell] = True
         pairs = i[mine[i]], j[mine[i]]
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
-    def _found(self, u: Array, reach: float) -> Places:
-        """The places that points of this rank face at a displacement, within a distance."""
-        i, j = self._near_cells(u, reach)
-        points, cells, r = self._points, self._cells, self._r0 + u
-        x, (centres, radii) = self._x(r), self._spheres(r)
+    def _found(self, u: Array, reach: float, points: Points | None = None) -> Places:
+        """The places that points, those of the rule if none are given, face at a displacement, within a distance."""
+        points, r = points or self._rule, self._r0 + u
+        return self._facing(points, self._places_in(points, *self._near_cells(u, reach), r, reach), r)
+
+    def _places_in(self, points: Points, i: Longs, j: Longs, r: Array, reach: float) -> Places:
+        """The places of cells j nearest to points of cells i, within a distance."""
+        cells = self._cells
+        x, (centres, radii) = self._x(points, r), self._spheres(r)
         count = np.bincount(points.cell, minlength=len(cells.nodes))
         order = np.argsort(points.cell, kind="stable")
         firsts = np.concatenate([[0], np.cumsum(count)])
@@ -380,9 +404,9 @@ class Touching:
         if not len(point):
             return _none()
         at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return self._facing(at.of(at.distance < reach), r, x)
+        return at.of(at.distance < reach)
 
-    def _facing(self, at: Places, r: Array, x: Array) -> Places:
+    def _facing(self, points: Points, at: Places, r: Array) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
         has one on each side of its own surface at most."""
         cells, number = self._cells, len(self._cells.nodes)
@@ -401,20 +425,16 @@ class Touching:
         at = at.of(stays)
         if not len(at.point):
             return at
-        points = self._points
-        _, (_, t1), (_, t2) = jets(cells.element, self._reference(at.point), r[cells.nodes[points.cell[at.point]]], 1)
+        X = points.shape[at.point] @ cells.element.points  # the shape functions are exact for them
+        (_, x), (_, t1), (_, t2) = jets(cells.element, X, r[cells.nodes[points.cell[at.point]]], 1)
         (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        above = np.sum(np.cross(t1, t2) * (x[at.point] - y), axis=1) > 0
+        above = np.sum(np.cross(t1, t2) * (x - y), axis=1) > 0
         at = replace(at, side=above.astype(np.int64))
         order = np.lexsort((at.distance, at.side, at.point))
         at = at.of(order)
         first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
-
-    def _reference(self, point: Longs) -> Array:
-        """Places (n, 2) of points in their cells: the shape functions are exact for them."""
-        return np.asarray(self._points.shape[point] @ self._cells.element.points)
 
 
 def _none() -> Places:

@@ -1,0 +1,317 @@
+"""Points of a quadrature that respects the cells of both surfaces: a cell is cut along the sides of those it faces.
+
+The forces of a pressure on the other surface are integrals of its shape functions, which have kinks at the sides of its
+cells. A rule on the cells of one surface integrates across them: the forces of a uniform pressure are then not those of
+one. So the corners of what a cell faces are projected on its plane, and each part of the cell that faces one other cell
+is cut into triangles with a rule of their own. M. A. Puso and T. A. Laursen, Computer Methods in Applied Mechanics and
+Engineering 193 (2004) 601-629.
+
+The cuts are those at an earlier state, whose number stands in a state as part of its history. So the points stay where
+they are on their surface while a state is solved: energy, forces and tangent are exact derivatives of each other, and
+need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the cuts anew.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.touching.nearest import BULGE, CORNERS, Cells, Longs, Places
+
+Array = NDArray[np.float64]
+Inside = NDArray[np.bool_]
+CELL = 0.5  # area of the reference cell
+NOTHING = 1e-12  # an area in it that is none
+LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
+SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
+CLOSE = 1e-9  # between corners that are one
+NOBODY = -1  # the cell that a part of a cell faces where none is
+ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
+FINE = 60  # parts of a side, at whose ends the distance from a rule's points is measured
+DIGITS = 6  # bytes of the number of a state: a float has all of them
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of this rank at which gaps are measured.
+
+    Attributes
+    ----------
+    cell
+        (n,) global number.
+    shape
+        (n, functions) of that cell.
+    weight
+        (n,) undeformed area over R^2.
+    faces
+        (n,) the cell that a point faced where the cuts were made; `NOBODY` where it faced none.
+    """
+
+    cell: Longs
+    shape: Array
+    weight: Array
+    faces: Longs
+
+    def of(self, which: Inside) -> "Points":
+        """Some of them."""
+        return Points(self.cell[which], self.shape[which], self.weight[which], self.faces[which])
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Convex polygons in reference cells.
+
+    Attributes
+    ----------
+    cell, faces
+        (n,) their cells, and what they face.
+    corners
+        (n, m, 2) from the left, some of them repeated.
+    """
+
+    cell: Longs
+    faces: Longs
+    corners: Array
+
+    @classmethod
+    def cells(cls, cell: Longs) -> "Pieces":
+        """Cells as they are, facing nobody."""
+        return cls(cell, np.full(len(cell), NOBODY), np.array(np.broadcast_to(CORNERS, (len(cell), 3, 2))))
+
+    def of(self, which: Longs | Inside) -> "Pieces":
+        """Some of them."""
+        return Pieces(self.cell[which], self.faces[which], self.corners[which])
+
+    def facing(self, faces: Longs) -> "Pieces":
+        """The same, facing others."""
+        return Pieces(self.cell, faces, self.corners)
+
+    def some(self) -> "Pieces":
+        """Those that have an area."""
+        return self.of(area(self.corners) > NOTHING)
+
+    def beside(self, other: "Pieces") -> "Pieces":
+        """These and others."""
+        most = max(self.corners.shape[1], other.corners.shape[1])
+        wider = [((0, 0), (0, most - each.corners.shape[1]), (0, 0)) for each in (self, other)]
+        corners = [np.pad(each.corners, by, "edge") for each, by in zip((self, other), wider, strict=True)]
+        cell, faces = ([getattr(self, name), getattr(other, name)] for name in ("cell", "faces"))
+        return Pieces(np.concatenate(cell), np.concatenate(faces), np.concatenate(corners))
+
+    def cut(self, a: Array, b: Array) -> "Pieces":
+        """What is left of lines from a (n, 2) to b."""
+        normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
+        left = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
+        left[np.abs(left) < NOTHING] = 0.0
+        after, to = np.roll(left, -1, axis=1), np.roll(self.corners, -1, axis=1)
+        crossed = left * after < 0
+        part = left / np.where(crossed, left - after, 1.0)
+        count, m = left.shape
+        ends = np.stack([self.corners, self.corners + part[..., None] * (to - self.corners)], axis=2)
+        apart = (to != self.corners).any(axis=2)
+        there = np.stack([(left >= 0) & apart, crossed], axis=2).reshape(count, 2 * m)
+        most = max(3, int(there.sum(axis=1).max(initial=0)))
+        first = np.argsort(~there, axis=1, kind="stable")[:, :most]
+        corners = np.take_along_axis(ends.reshape(count, 2 * m, 2), first[..., None], axis=1)
+        there = np.take_along_axis(there, first, axis=1)
+        return Pieces(self.cell, self.faces, np.where(there[..., None], corners, corners[:, :1]))
+
+
+def area(corners: Array) -> Array:
+    """Of polygons (n, m, 2), from the left."""
+    at = corners - corners[:, :1]
+    x, y = at[..., 0], at[..., 1]
+    return np.asarray(np.sum(x * np.roll(y, -1, 1) - np.roll(x, -1, 1) * y, axis=1) / 2)
+
+
+def covers(X: Array) -> float:
+    """How far the farthest place of an equilateral triangle is from the nearest of some points, over its side."""
+    lattice = np.array([(i, j) for i in range(FINE + 1) for j in range(FINE + 1 - i)]) / FINE
+    equal = np.array([[1.0, 0.0], [0.5, np.sqrt(3) / 2]])
+    return float(np.linalg.norm((lattice[:, None] - X) @ equal, axis=2).min(axis=1).max()) + 1 / FINE
+
+
+def centroid(corners: Array) -> Array:
+    """(n, 2) of polygons that have an area."""
+    at = corners - corners[:, :1]
+    after = np.roll(at, -1, 1)
+    twice = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
+    inner = np.einsum("nk,nki->ni", twice, at + after) / (3 * twice.sum(axis=1))[:, None]
+    return np.asarray(corners[:, 0] + inner)
+
+
+class Segments:
+    """The points on all parts of cells.
+
+    Parameters
+    ----------
+    rule
+        Of all cells of this rank.
+    X
+        (q, 2) of its points in the reference cell.
+    r0
+        (nodes, 3) undeformed.
+    degree
+        Of the rule on each triangle.
+
+    Attributes
+    ----------
+    within
+        (cells,): no place of a cell is farther from all points of the rule.
+    """
+
+    def __init__(self, cells: Cells, rule: Points, X: Array, weights: Array, r0: Array, degree: int) -> None:
+        self._cells, self._rule, self._r0 = cells, rule, r0
+        self._rules = (X, weights), basix.make_quadrature(basix.CellType.triangle, degree)
+        self._at_corners = cells.element.tabulate(0, CORNERS)[0, :, :, 0]
+        corners = self._corners(r0, np.arange(len(cells.nodes)))
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        self.within: Array = BULGE * covers(X) * sides
+
+    def points(self, near: Places, r: Array) -> Points:
+        """All points of this rank.
+
+        Parameters
+        ----------
+        near
+            Places in all cells that are near the rule's points.
+        r
+            (nodes, 3) where the cuts are made.
+        """
+        number, rule = len(self._cells.nodes), self._rule
+        if not len(near.point):
+            return rule
+        keys = np.unique(rule.cell[near.point] * number + near.cell)
+        one, other = keys // number, keys % number
+        order = np.argsort(self._corners(self._r0, other).mean(axis=1) @ ALONG, kind="stable")
+        one, other = one[order], other[order]
+        pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
+        fans = [self._on(pieces, k) for k in range(pieces.corners.shape[1])]
+        parts = [rule.of(~np.isin(rule.cell, one)), *(each for fan in fans for each in fan)]
+        return Points(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("cell", "shape", "weight", "faces")))
+
+    def _on(self, pieces: Pieces, k: int) -> list[Points]:
+        """The points on the triangles of the centroids and the corners k and k + 1; a triangle is one by itself.
+
+        So they do not depend on which corner is the first.
+        """
+        corners, made = pieces.corners, list[Points]()
+        apart = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2) > CLOSE
+        three = apart.sum(axis=1) == 3
+        others = np.argsort(~apart, axis=1, kind="stable")[:, :3]
+        own = np.take_along_axis(corners, others[..., None], axis=1)
+        first = np.where(three[:, None], own[:, 0], centroid(corners))
+        e1, e2 = corners[:, k] - first, np.roll(corners, -1, axis=1)[:, k] - first
+        e1[three], e2[three] = (own[three, 1] - first[three], own[three, 2] - first[three]) if k == 0 else (0.0, 0.0)
+        size = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+        large = size > 2 * LARGE
+        for (X, weights), these in zip(self._rules, (large, ~large & (size > NOTHING)), strict=True):
+            at = first[these, None] + X[:, :1] * e1[these, None] + X[:, 1:] * e2[these, None]
+            cell, faces = (np.repeat(each[these], len(X)) for each in (pieces.cell, pieces.faces))
+            table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
+            a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
+            weight = np.outer(size[these], weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
+            made.append(Points(cell, table[0], weight, faces))
+        return made
+
+    def _corners(self, r: Array, cell: Longs) -> Array:
+        return np.asarray(np.einsum("ck,nki->nci", self._at_corners, r[self._cells.nodes[cell]]))
+
+    def _projected(self, one: Longs, other: Longs, r: Array) -> Array:
+        """The corners (n, 3, 2) of cells in reference cells of others, along the normals of these."""
+        c, y = self._corners(r, one), self._corners(r, other)
+        sides = np.stack([c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]], axis=1)
+        X = (y - c[:, :1]) @ np.linalg.pinv(sides)
+        coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
+        coordinates[np.abs(coordinates) < SNAP] = 0.0
+        X = np.asarray((coordinates / coordinates.sum(axis=2, keepdims=True))[..., 1:])
+        level = np.argsort(self._corners(self._r0, other) @ ALONG, axis=1)
+        return np.take_along_axis(X, level[..., None], axis=1)
+
+
+class Cuts:
+    """The points with the cuts of displacements, which have numbers; 0 is undeformed.
+
+    Parameters
+    ----------
+    near
+        The places in all cells that are near the rule's points at a displacement (nodes, 3).
+    """
+
+    def __init__(self, segments: Segments, near: Callable[[Array], Places], r0: Array) -> None:
+        self._segments, self._near, self._r0 = segments, near, r0
+        self._displacements = {0.0: np.zeros_like(r0)}
+        self._latest = dict[float, Points]()
+
+    def points(self, number: float, u: Array) -> Points:
+        """Those of a number; one that is not known, as in a state from elsewhere, becomes that of u."""
+        if number not in self._latest:
+            at = self._displacements.setdefault(number, np.array(u))
+            self._latest = {**dict([*self._latest.items()][-1:]), number: self.at(at)}
+        return self._latest[number]
+
+    def at(self, u: Array) -> Points:
+        """Those of a displacement."""
+        return self._segments.points(self._near(u), self._r0 + u)
+
+    def numbered(self, u: Array) -> float:
+        """The number of a displacement, the same for the same one."""
+        number = float(int.from_bytes(hashlib.blake2b(np.array(u).tobytes(), digest_size=DIGITS).digest()))
+        self._displacements[number] = np.array(u)
+        return number
+
+
+def sides_of(triangles: Array) -> tuple[Array, Array]:
+    """The ends (n, 3, 2) of the sides of triangles, which have these on their left."""
+    a, b = triangles, np.roll(triangles, -1, axis=1)
+    right = (area(triangles) < 0)[:, None, None]
+    return np.where(right, b, a), np.where(right, a, b)
+
+
+def cut_along(triangles: Pieces) -> Pieces:
+    """Reference cells cut along the sides of triangles that they face.
+
+    Where these neither overlap nor leave a part of the cell, the pieces are what the cell has in common with each.
+    """
+    cells, number = np.unique(triangles.cell, return_inverse=True)
+    a, b = sides_of(triangles.corners)
+    common = Pieces.cells(triangles.cell).facing(triangles.faces)
+    for k in range(3):
+        common = common.cut(a[:, k], b[:, k])
+    met = (np.abs(area(triangles.corners)) > NOTHING) & (area(common.corners) > NOTHING)
+    common, number = common.of(met), number[met]
+    total = np.bincount(number, area(common.corners), len(cells))
+    part = np.abs(total - CELL) > NOTHING
+    if not part.any():
+        return common
+    inside, rest = _one_by_one(triangles.of(met).of(part[number]), cells[part])
+    left = np.bincount(np.searchsorted(cells, rest.cell), area(rest.corners), len(cells))
+    twice = cells[part & (np.abs(total + left - CELL) > NOTHING)]
+    kept = common.of(~np.isin(common.cell, twice))
+    return kept.beside(inside.of(np.isin(inside.cell, twice))).beside(rest)
+
+
+def _one_by_one(triangles: Pieces, cells: Longs) -> tuple[Pieces, Pieces]:
+    """What cells have in common with triangles, the later ones without the earlier ones; and what is left."""
+    triangles = triangles.of(np.argsort(triangles.cell, kind="stable"))
+    first = np.searchsorted(triangles.cell, cells)
+    number = np.searchsorted(triangles.cell, cells, "right") - first
+    rest = Pieces.cells(cells)
+    inside = rest.of(np.zeros(0, dtype=np.int64))
+    for turn in range(int(number.max(initial=0))):
+        at = np.searchsorted(cells, rest.cell)
+        has = number[at] > turn
+        by = triangles.of(first[at[has]] + turn)
+        asked, (a, b) = rest.of(has), sides_of(by.corners)
+        common = asked.facing(by.faces)
+        for k in range(3):
+            common = common.cut(a[:, k], b[:, k])
+        met = area(common.corners) > NOTHING
+        inside, rest, within = inside.beside(common.of(met)), rest.of(~has).beside(asked.of(~met)), asked.of(met)
+        for k in range(3):
+            rest = rest.beside(within.cut(b[met, k], a[met, k]).some())
+            within = within.cut(a[met, k], b[met, k])
+    return inside, rest
