@@ -1,6 +1,6 @@
 """The contacts of a model: its cells on all ranks, and the points of their quadrature."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import basix
@@ -76,7 +76,9 @@ def touchings(
     )
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
-    own, moved, kind = (3 * index.local_range[0], 3 * index.size_local), partial(whole, u), Touching
+    own = 3 * index.local_range[0], 3 * index.size_local
+    moved: Callable[[], Array] = partial(whole, u)
+    kind: Callable[..., Touching] = Touching
     if images:
         copies = Images(images, len(placed))
         vertices = _vertices(topology, on_planes)
@@ -107,4 +109,4 @@ def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Lo
     of_side, of_all = topology.connectivity(1, 0), topology.index_map(0)
     local = [of_side.links(int(side)) for side in np.concatenate(sides)]
     numbers = of_all.local_to_global(np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32))
-    return np.unique(over_ranks(topology.comm, numbers))
+    return np.asarray(np.unique(over_ranks(topology.comm, numbers)))
