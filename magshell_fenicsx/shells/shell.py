@@ -55,6 +55,7 @@ from magshell_fenicsx.parts.supports.supports import (
     refuse_unknown,
 )
 from magshell_fenicsx.parts.touching.building import touchings
+from magshell_fenicsx.parts.touching.mirrored import Mirrored
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.tee import tees
 from magshell_fenicsx.shells.terms import EnergyFactory
@@ -249,7 +250,8 @@ class ShellModel(Thin):
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
         rule = carrier.contact_rule
-        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule)
+        of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
+        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule, *of_images)
         terms += self.touchings
         terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
@@ -309,7 +311,7 @@ class ShellModel(Thin):
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
-        terms = [t.antisymmetric() if isinstance(t, InteractionTerm) else t for t in terms]
+        terms = [t.antisymmetric() if isinstance(t, InteractionTerm | Mirrored) else t for t in terms]
         system = self.system
         return AntisymmetricModes(
             FiniteElementSystem(

@@ -6,50 +6,54 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
+from scipy.spatial import cKDTree
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
 h, WIDTH, GAP, CLAMP, DOWN = 0.01, 0.02, 0.5, 1.6, 0.2
+CLAMPED = {"clamp_x": "lower_left_fx", "clamp_z": "lower_left_fz", "moment": "lower_left_my"}
 
 
 def elastica() -> dict[str, float]:
-    """Tips over the length of two inextensible strips.
+    """Two inextensible strips: tips over the length; force between them, and force and moment at a clamp, over EI.
 
-    One is the other turned by half a turn about the middle between the clamps. So each end presses on the other strip,
-    at the same arc length a with the same force N, and both forces on the lower strip are along its normal n there.
-    EI theta'' = F_x sin(theta) - F_y cos(theta) with the force F beyond: -2 N n up to a, -N n from there to the end.
+    One is the other turned by half a turn about the middle between the clamps. Each bulges towards the other, so that
+    they touch along one line in that middle, at the same arc length a with the same force F along the common normal n.
+    Beyond it both are straight, and lift off. EI theta'' = F cos(theta - theta(a)) up to a.
     """
 
     def slopes(s: Array, z: Array, p: Array) -> Array:
-        N, a, at = p
-        rows = []
-        for (_, _, angle, curvature), length, F in ((z[:4], a, 2 * N), (z[4:], 1 - a, N)):
-            bend = F * (np.sin(at) * np.sin(angle) + np.cos(at) * np.cos(angle))
-            rows += [length * each for each in (np.cos(angle), np.sin(angle), curvature, bend)]
-        return np.stack(rows)
+        F, a, at = p
+        return np.asarray(a * np.stack([np.cos(z[2]), np.sin(z[2]), z[3], F * np.cos(z[2] - at)]))
 
     def ends(z0: Array, z1: Array, p: Array, down: float) -> Array:
-        n, centre = np.array([-np.sin(p[2]), np.cos(p[2])]), np.array([CLAMP, (1 + GAP) * h - down])
-        apart = centre - z1[4:6] - z1[:2] - h * n
-        return np.array([*z0[:3], *(z0[4:] - z1[:4]), z1[7], z1[2] - p[2], *apart])
+        n, middle = np.array([-np.sin(p[2]), np.cos(p[2])]), np.array([CLAMP, (1 + GAP) * h - down]) / 2
+        return np.array([*z0[:3], z1[3], z1[2] - p[2], *(z1[:2] + h / 2 * n - middle)])
 
     s = np.linspace(0, 1, 41)
-    z = np.stack([0.6 * s, 0 * s, 0 * s, 0 * s, 0.6 + 0.4 * s, 0 * s, 0 * s, 0 * s])
-    p = np.array([0.01, 0.6, 0.0])
+    z = np.stack([0.8 * s, 0 * s, 0 * s, 0 * s])
+    p = np.array([0.01, 0.8, 0.0])
     for down in np.linspace(0.02, DOWN, 10):
         found = solve_bvp(slopes, lambda z0, z1, p, d=down: ends(z0, z1, p, d), s, z, p, tol=1e-8, max_nodes=5000)
         assert found.success
         s, z, p = found.x, found.y, found.p
-    x, y = z[4:6, -1]
-    lower = {"lower_x": x, "lower_z": y}
-    return {**lower, "upper_x": CLAMP - x, "upper_z": (1 + GAP) * h - DOWN - y}
+    F, a, at = p
+    beyond = z[:2, -1:] + np.linspace(0, 1 - a, 41) * np.array([[np.cos(at)], [np.sin(at)]])
+    lower = np.column_stack([found.sol(np.linspace(0, 1, 400))[:2], beyond])
+    upper = np.array([[CLAMP], [(1 + GAP) * h - DOWN]]) - lower
+    assert cKDTree(lower.T).query(upper.T)[0].min() > (1 - 1e-6) * h  # they touch nowhere else
+    x, z_tip = lower[:, -1]
+    return {
+        "lower_x": x, "lower_z": z_tip, "upper_x": CLAMP - x, "upper_z": (1 + GAP) * h - DOWN - z_tip,
+        "force": F, "clamp_x": -F * np.sin(at), "clamp_z": F * np.cos(at), "moment": z[3, 0],
+    }  # fmt: skip
 
 
 @pytest.mark.slow
 def test_two_cantilevers() -> None:
-    """Tips: 2e-3 of the way of the clamp."""
+    """The force between them, the force and moment at a clamp, and the tips over the way of the clamp: 2e-4."""
     strip = {"geometry": "plate", "length": 1, "width": WIDTH, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
     one: dict[str, Any] = {"shell": strip, "boundary": {"left": "clamped"}, "points": {"tip": [1, 0, 0]}}
     case = {
@@ -67,8 +71,14 @@ def test_two_cantilevers() -> None:
     scene = Scene(Case.from_source(case))
     *_, last = follow(scene)
     seen, expected = scene.observe(last.point.state), elastica()
+    D = h**3 / 12
     tips = {
         "lower_x": 1 + seen["lower_tip_ux"], "lower_z": seen["lower_tip_uz"],
         "upper_x": CLAMP - 1 + seen["upper_tip_ux"], "upper_z": (1 + GAP) * h + seen["upper_tip_uz"],
     }  # fmt: skip
-    assert tips == pytest.approx({name: expected[name] for name in tips}, abs=2e-3 * DOWN)
+    forces = {
+        "force": 2 * np.pi * seen["contact_force"] / WIDTH,
+        **{name: seen[column] / (D * WIDTH) for name, column in CLAMPED.items()},
+    }
+    assert tips == pytest.approx({name: expected[name] for name in tips}, abs=2e-4 * DOWN)
+    assert forces == pytest.approx({name: expected[name] for name in forces}, rel=2e-4)

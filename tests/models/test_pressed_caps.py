@@ -46,7 +46,8 @@ def test_two_caps_are_one_on_a_plane() -> None:
     place = {"position": list(MOVED), "axis": {"polar": 180}, "turn": 180}
     shells = {"lower": cap, "upper": {**cap, "place": place}}
     loading = pressed(lower_rim=1, upper_rim=-1)
-    two = Scene(Case.from_source({"shells": shells, "contact": [["upper", "lower"]], "mesh": MESH, "loading": loading}))
+    data = {"shells": shells, "contact": [["upper", "lower"]], "symmetry": "none", "mesh": MESH, "loading": loading}
+    two = Scene(Case.from_source(data))
     (touching,) = two.model.touchings
     r, of_one = (scene.model.r0.x.array.reshape(-1, 3) for scene in (two, one))
     (far, i), (far_turned, j) = (cKDTree(nodes).query(r) for nodes in (of_one, of_one @ TURNED.T + MOVED))

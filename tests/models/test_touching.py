@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.coupled import times
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.parts.touching.mirrored import Mirrored
 from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
@@ -25,6 +28,7 @@ RING: dict[str, Any] = {
     "contact": [["shell", "shell"]],
     "mesh": {"size": 0.2, "degree": 3},
     "loading": {"kind": "pressure"},
+    "symmetry": "none",
 }  # fmt: skip
 
 
@@ -39,9 +43,9 @@ def touching() -> Touching:
     return found
 
 
-def flattened(half: float, tilt: float, noise: float = 0.0, seed: int = 0) -> Array:
+def flattened(half: float, tilt: float, noise: float = 0.0, seed: int = 0, of: Scene | None = None) -> Array:
     """The ring with walls at +-half h (1 + tilt x) where |x| < 0.5, and wide ends, with noise over h."""
-    model = ring().model
+    model = (of or ring()).model
     h, r = model.material.h, model.r0.x.array.reshape(-1, 3)
     u = np.zeros_like(r)
     width = half * h * (1 + tilt * r[:, 0]) + 0.4 * np.maximum(np.abs(r[:, 0]) - 0.5, 0) ** 2
@@ -89,6 +93,50 @@ def test_the_tangent_holds_what_couples() -> None:
         Kv = (K * given).array * (system.held(np.ones(system.size)) != 0)
         low, high = (system.residual(u + side * v, mu) for side in (-0.5, 0.5))
         assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+
+
+def test_a_half_touches_its_image() -> None:
+    """Walls that meet in the plane: the energy and its variations, also by antisymmetric additions, are half of those
+    of the whole ring; the force is that of the whole; 1e-9."""
+    held = {**RING["boundary"], "east": {"held": ["x", "y", "z"]}}
+    points = {name: RING["points"][name] for name in ("east", "west")}
+    held.pop("north")
+    half, whole = (
+        Scene(Case.model_validate(RING | {"boundary": held, "points": points, "symmetry": symmetry}))
+        for symmetry in ("half", "none")
+    )
+    plane, other = half.problem.mirror, half.model.excluded_modes
+    assert plane is not None
+    assert isinstance(other, AntisymmetricModes)
+    places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
+    beyond = plane.beyond(all_places) < -1e-9
+    far, node = cKDTree(places).query(np.where(beyond[:, None], plane.image(all_places), all_places))
+    assert far.max() < 1e-12
+    (own,), (of_whole,) = (scene.model.touchings for scene in (half, whole))
+    system, state = half.model.system, State(flattened(0.497, 0.02, of=half), half.unloaded().mu)
+    system_of_whole, state_of_whole = whole.model.system, State(flattened(0.497, 0.02, of=whole), whole.unloaded().mu)
+    force, force_of_whole = (
+        scene.model.system.at(at).of(each.force) / scene.model.force_unit
+        for scene, at, each in ((half, state, own), (whole, state_of_whole, of_whole))
+    )
+    assert force == pytest.approx(force_of_whole, rel=1e-9)
+    energy = system.energies(state.u, state.mu)[own.name]
+    assert system_of_whole.energies(state_of_whole.u, state_of_whole.mu)[own.name] == pytest.approx(
+        2 * energy, rel=1e-9
+    )
+    entries_of_whole = system_of_whole.at(state_of_whole).of(of_whole.entries)
+    forces, forces_of_whole = (
+        each.forces(at.u, at.mu, own.name) for each, at in ((system, state), (system_of_whole, state_of_whole))
+    )
+    for of, sign in ((system, 1.0), (other.system, -1.0)):
+        v = of.held(np.random.default_rng(4).standard_normal(of.size))
+        image = sign * v.reshape(-1, 3)[node] @ plane.reflection
+        v_of_whole = np.where(beyond[:, None], image, v.reshape(-1, 3)[node]).ravel()
+        (term,) = (each for each in of.terms if isinstance(each, Mirrored))
+        second = v @ times([(1.0, of.at(state).of(term.entries))], v)
+        assert v_of_whole @ times([(1.0, entries_of_whole)], v_of_whole) == pytest.approx(2 * second, rel=1e-9)
+        first = forces @ v if sign > 0 else 0.0
+        assert forces_of_whole @ v_of_whole == pytest.approx(2 * first, rel=1e-9, abs=1e-9 * abs(forces @ v))
 
 
 def test_the_material_around_a_point_does_not_touch_it() -> None:
@@ -155,7 +203,7 @@ def test_a_step_that_passes_through() -> None:
     [
         ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
         ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
-        ({"symmetry": "half"}, "symmetry: half: a shell that may touch itself is modelled whole"),
+        ({"symmetry": "axisymmetric"}, "symmetry: axisymmetric: shells that may touch are modelled all around"),
         (
             {"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}},
             "contact: needs the same thickness everywhere; leave out shell.thickness_factor",

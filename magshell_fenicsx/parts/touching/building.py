@@ -1,14 +1,17 @@
 """The contacts of a model: its cells on all ranks, and the points of their quadrature."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import basix
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, mesh
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.connected import CellsOfAll, whole
+from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
+from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
 from magshell_fenicsx.parts.touching.segments import NOBODY, Points, Segments
@@ -26,6 +29,8 @@ def touchings(
     patches: Mapping[str, NDArray[np.bool_]],
     h: float,
     degree: int,
+    images: Sequence[Image] = (),
+    on_planes: Sequence[NDArray[np.int32]] = (),
 ) -> list[Touching]:
     """The contacts of pairs; collective.
 
@@ -37,6 +42,10 @@ def touchings(
         Thickness over R.
     degree
         Of the quadrature.
+    images
+        Of a half or a sector the copies that make the whole, itself first; none of a whole.
+    on_planes
+        The sides of this rank's cells on their planes.
 
     Raises
     ------
@@ -49,7 +58,7 @@ def touchings(
     domain, comm, index, element = V.mesh, V.mesh.comm, V.dofmap.index_map, V.element.basix_element
     topology, cells_of_all = domain.topology, CellsOfAll.of(V)
     count, first = len(cells_of_all.own), cells_of_all.own.start
-    for dims in ((2, 0), (0, 2)):
+    for dims in ((2, 0), (0, 2), (1, 0)):
         topology.create_connectivity(*dims)
 
     nodes = cells_of_all.nodes[first : first + count]
@@ -65,10 +74,19 @@ def touchings(
         (weights * np.linalg.norm(np.cross(a1, a2), axis=2)).ravel(),
         np.full(count * len(X), NOBODY),
     )
-    segments = Segments(cells, rule, X, weights, placed, element.degree)
     local = first, count + topology.index_map(2).num_ghosts
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
+    own = 3 * index.local_range[0], 3 * index.size_local
+    moved: Callable[[], Array] = partial(whole, u)
+    kind: Callable[..., Touching] = Touching
+    if images:
+        copies = Images(images, len(placed))
+        vertices = _vertices(topology, on_planes)
+        cells, placed = copies.cells(cells, placed, vertices), copies.placed(placed)
+        named = {name: copies.each(inside) for name, inside in named.items()}
+        kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
+    segments = Segments(cells, rule, X, weights, placed, element.degree)
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
@@ -76,9 +94,8 @@ def touchings(
         def allowed(i: Longs, j: Longs, one: Inside = one, other: Inside = other) -> NDArray[np.bool_]:
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
-        own = 3 * index.local_range[0], 3 * index.size_local
         own_h = pair.thickness * h
-        touching = Touching(pair, cells, rule, segments, allowed, own_h, placed, lambda: whole(u), own, local, comm)
+        touching = kind(pair, cells, rule, segments, allowed, own_h, placed, moved, own, local, comm)
         deep, place = touching.deepest()
         if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)
@@ -87,3 +104,11 @@ def touchings(
             )
         made.append(touching)
     return made
+
+
+def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Longs:
+    """Global numbers of the vertices of sides of cells, of all ranks; collective."""
+    of_side, of_all = topology.connectivity(1, 0), topology.index_map(0)
+    local = [of_side.links(int(side)) for side in np.concatenate(sides)]
+    numbers = of_all.local_to_global(np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32))
+    return np.asarray(np.unique(over_ranks(topology.comm, numbers)))

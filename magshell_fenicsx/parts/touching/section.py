@@ -9,7 +9,7 @@ from pydantic import Field
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, nothing
+from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -74,8 +74,8 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """No symmetry: what touches is modelled whole, for a mirror image would be another shell."""
-        return [Leaves("contact: a shell that may touch itself is modelled whole", mirrors=nothing)]
+        """All planes: a half sees its image."""
+        return [Leaves("contact: shells that may touch are modelled with their circumference")]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
@@ -156,10 +156,9 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface", "the same thickness everywhere", "a thickness that does not change")
-    if symmetry in ("half", "axisymmetric"):
+    if symmetry == "axisymmetric":
         raise ValueError(
-            f"symmetry: {symmetry}: a shell that may touch itself is modelled whole: take auto, or describe a part of "
-            "it between edges with boundary: symmetry"
+            "symmetry: axisymmetric: shells that may touch are modelled all around: take auto, half or none"
         )
     for step in context.steps:
         _refuse_step(step, context)
