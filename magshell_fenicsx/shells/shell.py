@@ -247,7 +247,8 @@ class ShellModel(Thin):
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
         rule = carrier.contact_rule
-        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule)
+        thick = factor, factory.law_of_cells.thins
+        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule, *thick)
         terms += self.touchings
         terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, whole
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
 from magshell_fenicsx.parts.touching.touching import Points, Touching
@@ -25,6 +26,8 @@ def touchings(
     patches: Mapping[str, NDArray[np.bool_]],
     h: float,
     degree: int,
+    thickness: fem.Function | None = None,
+    thins: Array | int = 0,
 ) -> list[Touching]:
     """The contacts of pairs; collective.
 
@@ -36,6 +39,10 @@ def touchings(
         Thickness over R.
     degree
         Of the quadrature.
+    thickness
+        What multiplies h, (1,); None for 1.
+    thins
+        1 in the cells of this rank (cells, 1) whose thickness follows from their area, or in all; else 0.
 
     Raises
     ------
@@ -65,6 +72,13 @@ def touchings(
         first,
         count + topology.index_map(2).num_ghosts,
     )
+    faces, thinning = None, np.broadcast_to(np.asarray(thins) > 0, (points.local, 1))[:, 0]
+    keeps_volume = cells_of_all.gathered(thinning)
+    if keeps_volume.any():
+        times = np.ones(nodes.shape)
+        if thickness is not None:
+            times = thickness.x.array[thickness.function_space.dofmap.list[:count]]
+        faces = Faces(cells, placed, h, cells_of_all.gathered(times), keeps_volume)
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     made = list[Touching]()
@@ -76,7 +90,7 @@ def touchings(
 
         own = 3 * index.local_range[0], 3 * index.size_local
         own_h = pair.thickness * h
-        touching = Touching(pair, cells, points, allowed, own_h, placed, lambda: whole(u), own, comm)
+        touching = Touching(pair, cells, points, allowed, own_h, placed, lambda: whole(u), own, comm, faces)
         deep, place = touching.deepest()
         if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)
