@@ -121,7 +121,7 @@ class Faces:
 
     def _sum(self, some: Any, values: Array) -> Array:
         """At nodes, of values (cells, functions) in some cells."""
-        return np.bincount(self._cells.nodes[some].ravel(), values.ravel(), len(self._r0))
+        return np.asarray(np.bincount(self._cells.nodes[some].ravel(), values.ravel(), len(self._r0)), dtype=float)
 
     def _around(self, which: NDArray[np.bool_]) -> Longs:
         """The cells with any of some nodes whose areas count."""
@@ -149,11 +149,11 @@ def unknowns(nodes: Longs, count: int, parts: int = 3) -> Longs:
     """Numbers (n, parts functions) of the unknowns at nodes (n, functions) of `count`: those of H, the fourth of parts,
     after all of the displacement."""
     dofs = np.concatenate([3 * nodes[:, :, None] + np.arange(3), 3 * count + nodes[:, :, None]], axis=2)[..., :parts]
-    return dofs.reshape(len(nodes), parts * nodes.shape[1])
+    return np.asarray(dofs.reshape(len(nodes), parts * nodes.shape[1]))
 
 
 def slope_of(n: Array, beta: Array, parts: int) -> Array:
     """The derivative (n, functions, parts) of distances along n (n, 3) by the unknowns, with beta of `touching`."""
     half = beta.shape[1] // 2
     thicker = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
-    return np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts]
+    return np.asarray(np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts])
