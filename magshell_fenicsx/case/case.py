@@ -81,8 +81,9 @@ class Case(WithParts):
     bodies: Bodies = Field(default_factory=dict)
     """Name -> rigid body that presses on the shell, or stands in its way"""
     contact: Pairs = Field(default=[])
-    """Pairs that may touch, half a thickness from their mid-surfaces, without friction: [[shell, shell]] is the shell
-    with itself; in place of `shell` the name of one of several shells, or of a patch of a mesh file"""
+    """Pairs that may touch, half a thickness from their mid-surfaces (of rubber half the deformed one), without
+    friction: [[shell, shell]] is the shell with itself; in place of `shell` the name of one of several shells, or of a
+    patch of a mesh file"""
     joints: Joints = Field(default=[])
     """Edges of several shells that meet, and how they are joined"""
     loading: Loading | None = None

@@ -251,7 +251,9 @@ class ShellModel(Thin):
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
         rule = carrier.contact_rule
         of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
-        self.touchings = touchings(loads.pairs, self.r0, self.u, midsurface.patches, material.h, rule, *of_images)
+        thick = factor, factory.law_of_cells.thins
+        surfaces = self.r0, self.u, midsurface.patches
+        self.touchings = touchings(loads.pairs, *surfaces, material.h, rule, *thick, *of_images)
         terms += self.touchings
         terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())

@@ -111,11 +111,12 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
     x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
     x = x0 + ends[1][: model.system.size].reshape(-1, 3)
+    half = h / 2 * min(model.system.at(stage.leave(high.state)).of(each.thinner) for each in model.touchings)
     seen_through = [*model.mirror.sides.values()] if model.multiplicity > 1 else []
     for plane in (each for each in model.planes if each not in seen_through):
         before, after = plane.beyond(x0), plane.beyond(x)
         side = np.sign(comm.allreduce(float(before.sum())))
-        if comm.allreduce(int(np.sum((side * before > h) & (side * after < h / 2)))):
+        if comm.allreduce(int(np.sum((side * before > h) & (side * after < half)))):
             raise PathStopped(
                 "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
                 "model both sides",

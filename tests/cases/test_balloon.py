@@ -146,15 +146,25 @@ def test_closed_sphere(share: float) -> None:
 
 
 class MagneticMembrane(Membrane):
-    """That of a part of the unit sphere, magnetised along its axis, in a field along it: the remanence turns with it.
+    """That of a part of the unit sphere, magnetised along its axis, in a field along it.
 
-    Per undeformed area w = W - lambda_m cos(phi - S), phi the slope of the deformed meridian. The momenta of
-    L = rho w + p r^2 z'/2 are integrated: that of z is zero, that of r changes by dL/dr.
+    Per undeformed area w = W - lambda_m m, with phi the slope of the deformed meridian and m = cos(phi - S) where the
+    remanence turns with the shell; where it deforms with it m = l1 sin(phi) sin(S) + cos(phi) cos(S)/(l1 l2).
+    The momenta of L = rho w + p r^2 z'/2 are integrated: that of z is zero, that of r changes by dL/dr.
     """
 
-    def __init__(self, end: float, lambda_m: float) -> None:
+    def __init__(self, end: float, lambda_m: float, *, deforms: bool) -> None:
         super().__init__(np.sin, end, 0.0)
-        self._lambda_m = lambda_m
+        self._lambda_m, self._deforms = lambda_m, deforms
+
+    def _field(self, along: float, around: float, phi: float, S: float) -> tuple[float, float, float]:
+        """Minus lambda_m times the derivatives of m by l1, l2 and phi."""
+        if not self._deforms:
+            return 0.0, 0.0, self._lambda_m * np.sin(phi - S)
+        inwards = np.cos(phi) * np.cos(S) / (along * around)
+        by_phi = along * np.cos(phi) * np.sin(S) - np.sin(phi) * np.cos(S) / (along * around)
+        of = np.sin(phi) * np.sin(S) - inwards / along, -inwards / around, by_phi
+        return -self._lambda_m * of[0], -self._lambda_m * of[1], -self._lambda_m * of[2]
 
     def _shot(self, stretch: float, p: float) -> Numbers:
         e, latest = 1e-4, [stretch, p * stretch**2 * 1e-4 / (2 * tensions(stretch, stretch, 0.0)[0])]
@@ -164,7 +174,8 @@ class MagneticMembrane(Membrane):
 
             def off(unknown: Numbers) -> list[float]:
                 along, phi = unknown
-                W1, turned = tensions(along, y[1] / np.sin(S), 0.0)[0], self._lambda_m * np.sin(phi - S) / along
+                by_along, _, by_phi = self._field(along, y[1] / np.sin(S), phi, S)
+                W1, turned = tensions(along, y[1] / np.sin(S), 0.0)[0] + by_along, by_phi / along
                 by_r, by_z = W1 * np.cos(phi) - turned * np.sin(phi), -W1 * np.sin(phi) - turned * np.cos(phi)
                 return [np.sin(S) * by_r - y[0], np.sin(S) * by_z + p * y[1] ** 2 / 2]
 
@@ -174,25 +185,29 @@ class MagneticMembrane(Membrane):
         def rates(S: float, y: Numbers) -> list[float]:
             along, phi = slopes(S, y)
             r1, z1 = along * np.cos(phi), -along * np.sin(phi)
-            return [tensions(along, y[1] / np.sin(S), 0.0)[1] + p * y[1] * z1, r1, z1]
+            W2 = tensions(along, y[1] / np.sin(S), 0.0)[1] + self._field(along, y[1] / np.sin(S), phi, S)[1]
+            return [W2 + p * y[1] * z1, r1, z1]
 
         begin = [e * tensions(stretch, stretch, 0.0)[0], stretch * e, 0.0]
         return np.asarray(solve_ivp(rates, (e, self._end), begin, rtol=1e-8, atol=1e-10).y[1:, -1])
 
 
 @pytest.mark.slow
-def test_magnetic_balloon() -> None:
-    """The case "magnetic_balloon.yaml": the field raises the largest pressure by 3.8 %, as in the membrane.
+@pytest.mark.parametrize(("remanence", "raised"), [("rotation", 1.038), ("deformation", 0.9993)])
+def test_magnetic_balloon(remanence: str, raised: float) -> None:
+    """The case "magnetic_balloon.yaml": the field raises the largest pressure as in the membrane, by 3.8 %,
+    where the remanence turns with the rubber, and leaves it where it deforms too.
 
     R/h = 100: pressures agree to the order h/R, and so their ratio far better.
     """
     p = dict[float, float]()
     of_membrane = dict[float, float]()
     for field in (0.0, 1.0):
-        settings = [f"magnetic.applied.flux_density={100 * field:g} mT"]
+        settings = [f"magnetic.applied.flux_density={100 * field:g} mT", f"magnetic.remanence={remanence}"]
         found = run(Case.load(CASES / "magnetic_balloon.yaml", settings))
         (fold,) = [row for row in found.rows if row["label"] == "fold"]
-        membrane = MagneticMembrane(np.pi / 3, field * 0.08 * 0.1 / (4e-7 * np.pi * 1e5))
+        lambda_m = field * 0.08 * 0.1 / (4e-7 * np.pi * 1e5)
+        membrane = MagneticMembrane(np.pi / 3, lambda_m, deforms=remanence == "deformation")
         p[field] = -float(fold["p_over_pc"]) * 4 / 3 / 100
         top = 0.5 - float(fold["w_pole_over_h"]) / 100
         around = [membrane.pressure(top + d, (1.6, p[field])) for d in (-0.1, 0.0, 0.1)]
@@ -200,5 +215,22 @@ def test_magnetic_balloon() -> None:
         assert p[field] == pytest.approx(around[1], rel=5e-3)
         of_membrane[field] = around[1]
     ratio = p[1.0] / p[0.0]
-    assert ratio == pytest.approx(1.038, abs=2e-3)
+    assert ratio == pytest.approx(raised, abs=2e-3)
     assert ratio == pytest.approx(of_membrane[1.0] / of_membrane[0.0], abs=2e-3)
+
+
+@pytest.mark.slow
+def test_models_of_a_balloon() -> None:
+    """Meridian, half and full dome of Mooney and Rivlin's rubber under a live pressure have the same fold, 5e-4; its
+    volume, at the flat top of the curve, to 1e-2."""
+    settings = ["shell.law=mooney-rivlin", "shell.mooney=0.05", "shell.thickness=1 mm", "loading.points=3"]
+    settings.append("loading.volume_change=600000 mm^3")
+    p, volume = list[float](), list[float]()
+    for symmetry in ("axisymmetric", "half", "none"):
+        mesh = [] if symmetry == "axisymmetric" else ["mesh={degree: 3, size: 12 mm}"]
+        found = run(Case.load(CASES / "balloon.yaml", [*settings, *mesh, f"symmetry={symmetry}"]))
+        (fold,) = [row for row in found.rows if row["label"] == "fold"]
+        p.append(float(fold["p_over_pc"]))
+        volume.append(float(fold["volume_change"]))
+    assert p[1:] == pytest.approx([p[0]] * 2, rel=5e-4)
+    assert volume[1:] == pytest.approx([volume[0]] * 2, rel=1e-2)

@@ -3,6 +3,8 @@
 import pytest
 from benchmarks.laws import computed, largest_strains
 
+from magshell_fenicsx.simulate.gradients.gradient import gradient
+
 
 def knockdown(law: str, R_over_h: float) -> tuple[float, float]:
     """k_d and the largest strain of the faces at the fold."""
@@ -29,3 +31,17 @@ def test_indentation_with_each_law() -> None:
         forces.append(records[-1].point.state.mu["force"])
         assert largest_strains(scene, records[-1])[1] == pytest.approx(0.051, abs=0.002)
     assert forces == pytest.approx([2.9403, 2.9949], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_slope_of_the_knockdown_by_the_ratio() -> None:
+    """dk_d/d(C01/C10) by the adjoint, against a difference of fourth order: 1e-5."""
+    k_d = dict[int, float]()
+    for n in (0, -2, -1, 1, 2):
+        scene, records = computed("dimple_buckling.yaml", "mooney-rivlin", 40, f"shell.mooney={0.5 + 0.02 * n:g}")
+        fold = next(record for record in records if record.label == "fold")
+        k_d[n] = fold.point.state.mu["pressure"]
+        if not n:
+            slope = gradient(scene, fold, of="instability", by="shell.mooney")["shell.mooney"]
+    known = (8 * (k_d[1] - k_d[-1]) - (k_d[2] - k_d[-2])) / (12 * 0.02)
+    assert slope == pytest.approx(known, rel=1e-5)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
@@ -29,6 +30,8 @@ def touchings(
     patches: Mapping[str, NDArray[np.bool_]],
     h: float,
     degree: int,
+    thickness: fem.Function | None = None,
+    thins: Array | int = 0,
     images: Sequence[Image] = (),
     on_planes: Sequence[NDArray[np.int32]] = (),
 ) -> list[Touching]:
@@ -42,6 +45,10 @@ def touchings(
         Thickness over R.
     degree
         Of the quadrature.
+    thickness
+        What multiplies h, (1,); None for 1.
+    thins
+        1 in the cells of this rank (cells, 1) whose thickness follows from their area, or in all; else 0.
     images
         Of a half or a sector the copies that make the whole, itself first; none of a whole.
     on_planes
@@ -75,6 +82,10 @@ def touchings(
         np.full(count * len(X), NOBODY),
     )
     local = first, count + topology.index_map(2).num_ghosts
+    times, thinning = np.ones(nodes.shape), np.broadcast_to(np.asarray(thins) > 0, (local[1], 1))[:, 0]
+    if thickness is not None:
+        times = thickness.x.array[thickness.function_space.dofmap.list[:count]]
+    times, keeps_volume = cells_of_all.gathered(times), cells_of_all.gathered(thinning)
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     own = 3 * index.local_range[0], 3 * index.size_local
@@ -85,7 +96,9 @@ def touchings(
         vertices = _vertices(topology, on_planes)
         cells, placed = copies.cells(cells, placed, vertices), copies.placed(placed)
         named = {name: copies.each(inside) for name, inside in named.items()}
+        times, keeps_volume = copies.each(times), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
+    faces = Faces(cells, placed, h, times, keeps_volume) if keeps_volume.any() else None
     segments = Segments(cells, rule, X, weights, placed, element.degree)
     made = list[Touching]()
     for pair in pairs:
@@ -95,7 +108,7 @@ def touchings(
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         own_h = pair.thickness * h
-        touching = kind(pair, cells, rule, segments, allowed, own_h, placed, moved, own, local, comm)
+        touching = kind(pair, cells, rule, segments, allowed, own_h, placed, moved, own, local, comm, faces)
         deep, place = touching.deepest()
         if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)

@@ -2,6 +2,9 @@
 
 A point of a surface is near the material around itself, which it does not touch. So a cell counts only if the way to it
 within the undeformed surface is long.
+
+Where the thickness changes with the state, vectors have a fourth component: half the thickness less the undeformed one,
+of x with the other sign. The distance is then that of the faces and h: |x - y| of the three, and the fourth of x - y.
 """
 
 from collections.abc import Iterator
@@ -31,6 +34,7 @@ ON_SIDE = 1e-12  # a barycentric coordinate that is zero
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 SIDES = np.array([[-1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])  # direction of the side opposite to each corner
 DOWN = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # derivatives of the barycentric coordinates
+SIGNS = np.array([1.0, 1.0, 1.0, -1.0])  # of the squares of components in the Hessian
 
 
 @dataclass(frozen=True)
@@ -136,8 +140,8 @@ class Places:
 
 
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
-    """Shape functions (n, functions) at places (n, 2), and the field of nodal vectors (n, functions, 3) there: itself
-    and its derivatives by the first coordinate, the second, and both twice."""
+    """Shape functions (n, functions) at places (n, 2), and the field of nodal vectors (n, functions, 3 or 4) there:
+    itself and its derivatives by the first coordinate, the second, and both twice."""
     for table in element.tabulate(order, X)[..., 0]:
         yield table, np.einsum("nk,nki->ni", table, nodal)
 
@@ -150,9 +154,9 @@ def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Arra
     Parameters
     ----------
     x
-        (n, 3) points.
+        (n, 3) points, or (n, 4).
     nodal
-        (n, functions, 3) of the triangles.
+        (n, functions, 3 or 4) of the triangles.
     X
         (n, 2) in the reference triangle.
 
@@ -180,7 +184,17 @@ def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Arra
         X[moving] = (hit / hit.sum(axis=1, keepdims=True))[:, 1:]
         moving = moving[np.abs(X[moving] - at).max(axis=1) > EXACT]
     (_, y), *_ = jets(cells.element, X, nodal, 0)
-    return X, free_at(cells, x, nodal, X), np.linalg.norm(x - y, axis=1)
+    return X, free_at(cells, x, nodal, X), distances(x - y)
+
+
+def distances(off: Array) -> Array:
+    """Those (n,) of the differences (n, 3) between points and places, or (n, 4) with the thickness."""
+    return np.asarray(np.linalg.norm(off[:, :3], axis=1) + off[:, 3:].sum(axis=1))
+
+
+def straight(off: Array) -> Array:
+    """The same differences, with their length as the fourth component if there is one."""
+    return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
 
 def free_at(cells: Cells, x: Array, nodal: Array, X: Array) -> Array:
@@ -191,7 +205,7 @@ def free_at(cells: Cells, x: Array, nodal: Array, X: Array) -> Array:
 def _convex(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Array]:
     """Gradient and Hessian of half the square of the distance, with that of a plane where it is not convex."""
     (_, y), (_, y1), (_, y2), (_, y11), (_, y12), (_, y22) = jets(cells.element, X, nodal)
-    g, A = slopes(x - y, y1, y2, y11, y12, y22)
+    g, A = slopes(straight(x - y), y1, y2, y11, y12, y22)
     plane = slopes(0 * y, y1, y2, y11, y12, y22)[1]
     bent = (np.linalg.det(A) < FLAT * np.linalg.det(plane)) | (np.trace(A, axis1=1, axis2=2) <= 0)
     return g, np.where(bent[:, None, None], plane, A)
@@ -202,13 +216,17 @@ def _barycentric(X: Array) -> Array:
 
 
 def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array) -> tuple[Array, Array]:
-    """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2, 2)."""
+    """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2, 2).
+
+    With a fourth component both are |x - y| times those of the distance, the Hessian where the gradient is zero.
+    """
 
     def dot(a: Array, b: Array) -> Array:
         return np.asarray(np.sum(a * b, axis=1))
 
-    mixed = dot(y1, y2) - dot(off, y12)
-    A = np.stack([dot(y1, y1) - dot(off, y11), mixed, mixed, dot(y2, y2) - dot(off, y22)], axis=1).reshape(-1, 2, 2)
+    z1, z2 = y1 * SIGNS[: y1.shape[1]], y2 * SIGNS[: y2.shape[1]]
+    mixed = dot(y1, z2) - dot(off, y12)
+    A = np.stack([dot(y1, z1) - dot(off, y11), mixed, mixed, dot(y2, z2) - dot(off, y22)], axis=1).reshape(-1, 2, 2)
     return -np.stack([dot(off, y1), dot(off, y2)], axis=1), A
 
 

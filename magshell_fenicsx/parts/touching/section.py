@@ -155,7 +155,9 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
-    context.needs("contact", "a mid-surface", "the same thickness everywhere", "a thickness that does not change")
+    context.needs("contact", "a mid-surface", "the same thickness everywhere")
+    if "a thickness that does not change" in context.withdrawn:  # faces are known by the undeformed volume
+        context.needs("contact of rubber", "the area as drawn")
     if symmetry == "axisymmetric":
         raise ValueError(
             "symmetry: axisymmetric: shells that may touch are modelled all around: take auto, half or none"

@@ -11,6 +11,9 @@ With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distanc
 
 where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
 Springer 2006, sec. 4.1 and 9.
+
+Shells that get thinner have half the thickness H at nodes as a fourth unknown: d is then the least of |x - y| - H(y),
+less H(x), plus h, so that |x - y| need not be the least. H follows from the displacement (`Faces`).
 """
 
 from collections.abc import Callable
@@ -24,9 +27,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BULGE,
+    SIGNS,
     Cells,
     Joined,
     Longs,
@@ -77,6 +82,8 @@ class Touching:
         All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
     own, local
         Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
+    faces
+        How far they are from the mid-surface where the thickness changes with the state; None where it does not.
     """
 
     amplitude = None
@@ -95,12 +102,14 @@ class Touching:
         own: tuple[int, int],
         local: tuple[int, int],
         comm: MPI.Comm,
+        faces: Faces | None = None,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
         self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
         self._cells, self._rule, self._segments, self._allowed, self._h = cells, rule, segments, allowed, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
+        self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
         self._beside = cells.near_in_surface(r0, BESIDE * h)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._cuts = Cuts(segments, self._near, r0)
@@ -126,14 +135,9 @@ class Touching:
         return float(self._points.weight[at.point[joined.first]] @ value) / 2
 
     def add_residual(self, b: Array, factor: float) -> None:
-        whole = np.zeros(self._r0.shape)
-        at, joined, (_, first, _) = self._pressed()
-        if len(at.point):
-            _, n, beta, nodes = self._geometry(at)
-            share = factor * joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
-            forces = -share[:, None, None] * beta[:, :, None] * n[:, None, :]
-            np.add.at(whole, nodes, forces)
-        add_own(b, whole, self._own, self._comm)
+        whole = self._forces()
+        forces = whole[:, :3] + (self._faces.slope(self._at, whole[:, 3]) if self._faces else 0.0)
+        add_own(b, factor * forces, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
@@ -156,7 +160,7 @@ class Touching:
             part = slice(some[0], after[0] if len(after) else len(keys))
             H, nodes = self._hessians(at.of(part), weight[part], first[part], second[part])
             sums = np.add.reduceat(H, some - some[0], axis=0)
-            dofs = (3 * nodes[some - some[0]][:, :, None] + np.arange(3)).reshape(len(some), -1)
+            dofs = unknowns(nodes[some - some[0]], len(self._r0), self._parts)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
             rows.append(i.ravel())
             columns.append(j.ravel())
@@ -167,7 +171,8 @@ class Touching:
         if several.any():
             i, j, v = self._between(whole, joined, of_group, bend)
             rows, columns, values = [*rows, i], [*columns, j], [*values, v]
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+        entries = np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+        return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
 
     # what is seen
 
@@ -215,18 +220,23 @@ class Touching:
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
+    def thinner(self, u: Array | None = None) -> float:
+        """The least deformed thickness, over the undeformed one, at the present or a given displacement; collective."""
+        half = self._faces.half(self._now() if u is None else u) if self._faces else self._h / 2
+        return min(1.0, 2 * float(np.min(half)) / self._h)
+
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
 
-        Between two looks none moves, relative to another, by more than a part of the thickness.
+        Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
-        moved = v - u
+        moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
-        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * self._h)))
+        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
         if not self._near_on_way(u, v):
             return False
         for k in range(1, looks):
-            near = self._found(u + k / looks * (v - u), NEARER * self._h)
+            near = self._found(u + k / looks * (v - u), NEARER * least, faces=False)
             if self._comm.allreduce(len(near.point)):
                 return True
         return False
@@ -258,8 +268,7 @@ class Touching:
     def _near(self, u: Array) -> Places:
         """The places in all cells that may press on cells of this rank at a displacement."""
         far = self._h + self._segments.within
-        i, j = self._near_cells(u, float(far.max()))
-        near = self._places_in(self._rule, i, j, self._r0 + u, float(far.max()))
+        near = self._places_in(self._rule, u, self._placed(u), float(far.max()))
         return near.of(near.distance < far[self._rule.cell[near.point]])
 
     # geometry
@@ -267,8 +276,24 @@ class Touching:
     def _now(self) -> Array:
         return self._u()
 
+    def _placed(self, u: Array, *, faces: bool = True) -> Array:
+        """All nodes, with half of what the thickness gains as a fourth component if it changes; see `nearest`."""
+        r = self._r0 + u
+        return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
+
     def _x(self, points: Points, r: Array) -> Array:
-        return np.asarray(np.einsum("nk,nki->ni", points.shape, r[self._cells.nodes[points.cell]]))
+        nodal = r[self._cells.nodes[points.cell]] * SIGNS[: r.shape[1]]
+        return np.asarray(np.einsum("nk,nki->ni", points.shape, nodal))
+
+    def _forces(self) -> Array:
+        """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
+        at, joined, (_, first, _) = self._pressed()
+        forces = np.zeros((len(self._r0), self._parts))
+        if len(at.point):
+            _, n, beta, nodes = self._geometry(at)
+            share = joined.weight * self._points.weight[at.point] / 2 * first[joined.group]
+            np.add.at(forces, nodes, -share[:, None, None] * slope_of(n, beta, self._parts))
+        return forces
 
     def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
@@ -287,11 +312,11 @@ class Touching:
         some = joined.several[joined.group]
         part, group = at.of(some), joined.group[some]
         _, n, beta, nodes = self._geometry(part)
-        g = (joined.weight[some, None, None] * beta[:, :, None] * n[:, None, :]).reshape(len(n), -1)
-        dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(n), -1)
+        g = (joined.weight[some, None, None] * slope_of(n, beta, self._parts)).reshape(len(n), -1)
+        dofs = unknowns(nodes, len(self._r0), self._parts)
         at_row = np.repeat(group, dofs.shape[1])
-        size = len(first), self._r0.size
-        G = scipy.sparse.coo_array((g.ravel(), (at_row, dofs.ravel())), size).tocsr()
+        entries = g.ravel(), (at_row, dofs.ravel())
+        G = scipy.sparse.coo_array(entries, (len(first), self._parts * len(self._r0))).tocsr()
         weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
         hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
         return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
@@ -310,28 +335,27 @@ class Touching:
     def _hessians(self, at: Places, weight: Array, first: Array, second: Array) -> tuple[Array, Longs]:
         """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
         d, n, beta, nodes = self._geometry(at)
-        r, half = self._r0 + self._at, nodes.shape[1] // 2
-        table = list(jets(self._cells.element, at.X, r[nodes[:, half:]]))
-        y = [each for _, each in table]
-        A = slopes(d[:, None] * n, y[1], y[2], y[3], y[4], y[5])[1]
+        half, parts = nodes.shape[1] // 2, self._parts
+        shapes, y = zip(*jets(self._cells.element, at.X, self._placed(self._at)[nodes[:, half:]]), strict=True)
+        normal = np.column_stack([n, 0 * d])[:, None, :parts]
+        off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :parts]
+        A = slopes(off[:, 0], *y[1:])[1]
         M = np.einsum("nik,nkl,njl->nij", at.free, inverse(at.free, A), at.free)
-        along = np.zeros((2, *beta.shape))
+        C = np.zeros((len(d), 2, *beta.shape[1:], parts))
         for a in range(2):
-            along[a, :, half:] = table[1 + a][0]
-        slope = [
-            -beta[:, :, None] * y[1 + a][:, None, :] - (d[:, None] * along[a])[:, :, None] * n[:, None, :]
-            for a in range(2)
-        ]
-        C = np.stack(slope, axis=1).reshape(len(d), 2, -1)
-        g = (beta[:, :, None] * n[:, None, :]).reshape(len(d), -1)
+            across = y[1 + a][:, None] * (SIGNS[:parts] > 0)
+            across -= np.sum(normal * across, axis=2, keepdims=True) * normal
+            C[:, a] = -beta[:, :, None] * across
+            C[:, a, half:] -= shapes[1 + a][:, :, None] * off
         bent = weight * first / d
-        left = np.concatenate([g[:, None], C], axis=1)
-        middle = np.zeros((len(d), 3, 3))
-        middle[:, 0, 0], middle[:, 1:, 1:] = weight * second + bent, bent[:, None, None] * M
+        rows = [slope_of(n, beta, parts)[:, None], (beta[:, :, None] * normal)[:, None], C]
+        left = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
+        middle = np.zeros((len(d), 4, 4))
+        middle[:, 0, 0], middle[:, 1, 1], middle[:, 2:, 2:] = weight * second, bent, bent[:, None, None] * M
         H = left.transpose(0, 2, 1) @ (middle @ left)
         both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
         for i in range(3):
-            H[:, i::3, i::3] -= both
+            H[:, i::parts, i::parts] -= both
         return H, nodes
 
     def _near_on_way(self, u: Array, v: Array) -> bool:
@@ -372,31 +396,34 @@ class Touching:
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
-    def _found(self, u: Array, reach: float, points: Points | None = None) -> Places:
-        """The places that points, those of the rule if none are given, face at a displacement, within a distance."""
-        points, r = points or self._rule, self._r0 + u
-        return self._facing(points, self._places_in(points, *self._near_cells(u, reach), r, reach), r)
+    def _found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
+        """The places that points, those of the rule if none are given, face at a displacement, within a distance of
+        faces or mid-surfaces."""
+        points, r = points or self._rule, self._placed(u, faces=faces)
+        return self._facing(points, self._places_in(points, u, r, reach), r[:, :3])
 
-    def _places_in(self, points: Points, i: Longs, j: Longs, r: Array, reach: float) -> Places:
-        """The places of cells j nearest to points of cells i, within a distance."""
+    def _places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
+        """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
+        of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
+        i, j = self._near_cells(u, reach)
         cells = self._cells
-        x, (centres, radii) = self._x(points, r), self._spheres(r)
+        x, (centres, radii) = self._x(points, r), self._spheres(r[:, :3])
         count = np.bincount(points.cell, minlength=len(cells.nodes))
         order = np.argsort(points.cell, kind="stable")
         firsts = np.concatenate([[0], np.cumsum(count)])
         n = count[i]
         within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
         point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
-        close = np.linalg.norm(x[point] - centres[cell], axis=1) < radii[cell] + reach
+        close = np.linalg.norm(x[point, :3] - centres[cell], axis=1) < radii[cell] + reach
         point, cell = point[close], cell[close]
         if not len(point):
             return _none()
         X, shape = cells.lattice
         used, which = np.unique(cell, return_inverse=True)
-        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used]])
+        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
         start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
         for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
-            away = np.linalg.norm(spread[which[some]] - x[point[some], None], axis=2)
+            away = np.linalg.norm(spread[which[some]] - x[point[some], None, :3], axis=2)
             start[some] = away.argmin(axis=1)
             least[some] = away[np.arange(len(some)), start[some]]
         close = least < reach + BETWEEN * radii[cell]
@@ -404,7 +431,7 @@ class Touching:
         if not len(point):
             return _none()
         at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return at.of(at.distance < reach)
+        return at.of(at.distance < of_faces)
 
     def _facing(self, points: Points, at: Places, r: Array) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point

@@ -1,0 +1,159 @@
+"""How far faces of rubber are from the mid-surface: half the deformed thickness, a continuous function of the place.
+
+At each node it is the undeformed volume per deformed area of the cells around, and between nodes their polynomial:
+
+    H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell gets thinner as it stretches, J0 where it does not,
+
+with J = |a_1 x a_2| of the cell at the node. Its derivatives by the displacement are exact.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.parts.touching.nearest import Cells, Longs
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Tilted:
+    """Areas of some cells at their nodes.
+
+    Attributes
+    ----------
+    J
+        (cells, places).
+    normal
+        (cells, places, 3).
+    by_node
+        (cells, places, 3 nodes, 3): derivatives of a_1 x a_2 by the components of all nodes.
+    """
+
+    J: Array
+    normal: Array
+    by_node: Array
+
+    @property
+    def slope(self) -> Array:
+        """Derivatives (cells, places, 3 nodes) of J."""
+        return np.asarray(np.einsum("cqmi,cqi->cqm", self.by_node, self.normal))
+
+
+class Faces:
+    """Half the thickness at all nodes.
+
+    Parameters
+    ----------
+    r0
+        (nodes, 3) undeformed.
+    h
+        Thickness over R.
+    thickness, thins
+        (cells, functions) what multiplies it at the nodes of each cell, and (cells,) whether it follows from the area.
+    """
+
+    def __init__(self, cells: Cells, r0: Array, h: float, thickness: Array, thins: NDArray[np.bool_]) -> None:
+        self._cells, self._r0, self._thins, self._thin = cells, r0, thins, np.flatnonzero(thins)
+        self._table = cells.element.tabulate(1, cells.element.points)[1:, :, :, 0]
+        J0 = self._areas(r0, slice(None))
+        self._volume = h / 2 * self._sum(slice(None), thickness * J0)
+        self._stays = self._sum(~thins, J0[~thins])
+
+    def half(self, u: Array) -> Array:
+        """(nodes,), over R, at a displacement (nodes, 3)."""
+        return np.asarray(self._volume / self._area(u))
+
+    def slope(self, u: Array, f: Array) -> Array:
+        """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
+        return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(-1, 3))
+
+    def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
+        """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
+        area = self._area(u)
+        return scipy.sparse.diags_array(np.where(which, -self._volume / area**2, 0.0)) @ self._slopes(u, which)
+
+    def hessian(self, u: Array, f: Array) -> Any:
+        """The sparse second derivative (3 nodes, 3 nodes) of sum f H."""
+        some, area, by = self._around(f != 0), self._area(u), self._slopes(u, f != 0)
+        weight = -f * self._volume / area**2
+        whole = by.T @ scipy.sparse.diags_array(-2 * weight / area) @ by
+        at, nodes = self._tilted(u, some), self._cells.nodes[some]
+        T, slope, w = at.by_node, at.slope, weight[nodes]
+        H = np.einsum("cqmi,cqni->cmn", T * (w / at.J)[..., None, None], T)
+        H -= np.einsum("cqm,cqn->cmn", slope * (w / at.J)[..., None], slope)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            twist = np.einsum("cq,qm,qn->cmn", w * at.normal[..., k], *self._table)
+            twist -= np.swapaxes(twist, 1, 2)
+            H[:, i::3, j::3] += twist
+            H[:, j::3, i::3] -= twist
+        dofs = unknowns(nodes, len(self._r0))
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+        return whole + scipy.sparse.coo_array((H.ravel(), (rows.ravel(), columns.ravel())), whole.shape).tocsr()
+
+    def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
+        """Those of a second derivative by the displacement, of one by the displacement and H.
+
+        Parameters
+        ----------
+        f
+            (nodes,) the first derivative by H.
+        """
+        rows, columns, values = entries
+        size, count = 4 * len(f), 3 * len(f)
+        which = np.zeros(size, dtype=bool)
+        which[rows] = True
+        by_u = scipy.sparse.vstack([scipy.sparse.eye_array(count), self.jacobian(u, which[count:])]).tocsr()
+        K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
+        i, j, v = scipy.sparse.find(by_u.T @ K @ by_u + self.hessian(u, f))
+        return i.astype(np.int64), j.astype(np.int64), v
+
+    def _area(self, u: Array) -> Array:
+        return self._stays + self._sum(self._thin, self._areas(self._r0 + u, self._thin))
+
+    def _areas(self, r: Array, some: Any) -> Array:
+        a1, a2 = np.einsum("dqk,cki->dcqi", self._table, r[self._cells.nodes[some]])
+        return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
+
+    def _sum(self, some: Any, values: Array) -> Array:
+        """At nodes, of values (cells, functions) in some cells."""
+        return np.asarray(np.bincount(self._cells.nodes[some].ravel(), values.ravel(), len(self._r0)), dtype=float)
+
+    def _around(self, which: NDArray[np.bool_]) -> Longs:
+        """The cells with any of some nodes whose areas count."""
+        return np.flatnonzero(which[self._cells.nodes].any(axis=1) & self._thins)
+
+    def _slopes(self, u: Array, which: NDArray[np.bool_]) -> Any:
+        """Derivatives (nodes, 3 nodes) of the areas at some nodes."""
+        some = self._around(which)
+        nodes, slope = self._cells.nodes[some], self._tilted(u, some).slope
+        rows, columns = np.broadcast_arrays(nodes[:, :, None], unknowns(nodes, len(self._r0))[:, None, :])
+        size = len(self._r0), self._r0.size
+        return scipy.sparse.coo_array((slope.ravel(), (rows.ravel(), columns.ravel())), size).tocsr()
+
+    def _tilted(self, u: Array, some: Longs) -> _Tilted:
+        a1, a2 = np.einsum("dqk,cki->dcqi", self._table, (self._r0 + u)[self._cells.nodes[some]])
+        n = np.cross(a1, a2)
+        J = np.linalg.norm(n, axis=-1)
+        one, two = self._table[..., None]
+        between = one * a2[:, :, None] - two * a1[:, :, None]  # e x this is the derivative along e
+        turned = np.cross(np.eye(3), between[..., None, :])
+        return _Tilted(J, n / J[..., None], turned.reshape(*J.shape, 3 * J.shape[1], 3))
+
+
+def unknowns(nodes: Longs, count: int, parts: int = 3) -> Longs:
+    """Numbers (n, parts functions) of the unknowns at nodes (n, functions) of `count`: those of H, the fourth of parts,
+    after all of the displacement."""
+    dofs = np.concatenate([3 * nodes[:, :, None] + np.arange(3), 3 * count + nodes[:, :, None]], axis=2)[..., :parts]
+    return np.asarray(dofs.reshape(len(nodes), parts * nodes.shape[1]))
+
+
+def slope_of(n: Array, beta: Array, parts: int) -> Array:
+    """The derivative (n, functions, parts) of distances along n (n, 3) by the unknowns, with beta of `touching`."""
+    half = beta.shape[1] // 2
+    thicker = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
+    return np.asarray(np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts])

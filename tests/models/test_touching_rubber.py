@@ -1,0 +1,145 @@
+"""Rubber that touches rubber, other shells and itself: faces are half the deformed thickness from mid-surfaces."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from along import csr
+from numpy.typing import NDArray
+from scipy.sparse.linalg import spsolve
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.gap import SOFT
+
+Array = NDArray[np.float64]
+h, FOUNDATION = 0.02, 1e-3  # over R; over E/R
+TENSION, PRESSURE = 0.2, 2.0  # over E h, and over E h/R
+
+
+def sheets(*, laws: tuple[str, str] = ("neo-hookean", "neo-hookean"), thick: float = 1.0) -> Scene:
+    """Two unit squares whose faces meet, pulled in both directions and pressed together; the upper one h `thick`."""
+
+    def sheet(law: str, thickness: float, z: float) -> dict[str, Any]:
+        shell = {"geometry": "plate", "length": 1, "width": 1, "youngs_modulus": 1, "poisson_ratio": 0.5}
+        return {
+            "shell": shell | {"thickness": thickness, "law": law},
+            "boundary": {"left": "symmetry", "bottom": "symmetry"},
+            "place": {"position": [0, 0, z]},
+        }
+
+    names, T = ("lower", "upper"), TENSION * h
+    pulls = [{"edge": f"{name}.right", "per_length": [T, 0, 0]} for name in names]
+    pulls += [{"edge": f"{name}.top", "per_length": [0, T, 0]} for name in names]
+    pushes = [
+        {"over": name, "per_area": [0, 0, side * PRESSURE * h]} for name, side in zip(names, (1, -1), strict=True)
+    ]
+    case = {
+        "shells": {"lower": sheet(laws[0], h, 0), "upper": sheet(laws[1], thick * h, (1 + thick) / 2 * h)},
+        "contact": [["upper", "lower"]],
+        "foundation": {"stiffness": FOUNDATION},
+        "mesh": {"degree": 2, "size": 0.7},
+        "loading": {"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": [*pulls, *pushes]},
+    }
+    return Scene(Case.model_validate(case))
+
+
+def test_gap_of_stretched_sheets() -> None:
+    """Rubber that is 1.5 h thick has h 1.5/(1.3 1.2) when stretched, a sheet of Koiter's law h as before."""
+    scene = sheets(laws=("koiter", "neo-hookean"), thick=1.5)
+    model, r0 = scene.model, scene.model.r0.x.array.reshape(-1, 3)
+    u = (r0 * [0.3, 0.2, 0.1]).ravel()
+    gap = model.system.at(State(u, scene.unloaded().mu)).of(model.touchings[0].least_gap)
+    assert gap == pytest.approx(1.1 * 1.25 * h - h / 2 - 0.75 * h / (1.3 * 1.2), abs=1e-14)
+
+
+def test_pressed_sheets() -> None:
+    """Newton's method is quadratic; mid-surfaces are h/l^2 apart, and pressing stretches: h 1e-6.
+
+    With the pressure q per undeformed area, the tension T and the penetration s, of each sheet
+
+        (E h/3)(l - l^-5) = T + q h/(2 l^3),   d = h/l^2 - s,   q = k (s - SOFT h/2).
+    """
+    scene = sheets()
+    model, (term,) = scene.model, scene.model.touchings
+    system, r0 = model.system, model.r0.x.array.reshape(-1, 3)
+    upper = r0[:, 2] > h / 2
+    guess = r0 * [0.14, 0.15, 0.0]
+    guess[upper, 2] = -0.25 * h
+    u, mu, steps = system.held(guess.ravel()), scene.unloaded().mu | {"load": 1.0}, list[float]()
+    for _ in range(12):
+        step = spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
+        u, steps = u - step, [*steps, float(np.abs(step).max())]
+    assert steps[-1] < 1e-12
+    below = [(a, b) for a, b in pairwise(steps) if a < 0.1 and b > 1e-12]
+    assert len(below) >= 2
+    assert all(b < 1e3 * a**2 for a, b in below), steps
+    r = r0 + u.reshape(-1, 3)
+    assert np.ptp(r[upper, 2]) < 1e-9 * h
+    stretch, d = r[upper, 0].max(), r[upper, 2].mean() - r[~upper, 2].mean()
+    assert stretch > 1.14
+    q = system.at(State(u, mu)).of(term.force)  # over E h/R, of an area of one
+    assert q == pytest.approx(PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h, rel=1e-9)
+    assert (stretch - stretch**-5) / 3 == pytest.approx(TENSION + q * h / (2 * stretch**3), rel=1e-6)
+    s = q / term.stiffness.value + SOFT * h / 2
+    assert d == pytest.approx(h / stretch**2 - s, abs=1e-6 * h)
+
+
+def ring() -> Scene:
+    """A tube between mirrors that can be pressed flat."""
+    shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
+    held = {"east": {"held": ["y"]}, "west": {"held": ["y"]}, "north": {"held": ["x"]}}
+    return Scene(
+        Case.model_validate(
+            {
+                "shell": shell | {"poisson_ratio": 0.5, "law": "mooney-rivlin", "mooney": 0.1},
+                "boundary": {"bottom": "symmetry", "top": "symmetry"} | held,
+                "points": {"east": [1, 0, 0], "west": [-1, 0, 0], "north": [0, 1, 0]},
+                "contact": [["shell", "shell"]],
+                "mesh": {"size": 0.2, "degree": 3},
+                "loading": {"kind": "pressure"},
+            }
+        )
+    )
+
+
+def test_derivatives() -> None:
+    """Of a tube that is pressed flat and stretched, at rough states: differences of energy and forces, 1e-6."""
+    scene = ring()
+    system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
+    r = scene.model.r0.x.array.reshape(-1, 3)
+    flat = 0 * r
+    flat[:, 0] = 0.3 * r[:, 0]
+    width = 0.4 * h * (1 + 0.02 * r[:, 0]) + 2.5 * np.maximum(np.abs(r[:, 0]) - 0.5, 0) ** 2
+    flat[:, 1] = np.tanh(r[:, 1] / 0.2) * width - r[:, 1]
+    for seed in range(2):
+        rough, moved, other = (
+            system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
+        )
+        u, v = system.held(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
+        at = system.at(State(u, mu))
+        entries = at.of(term.entries)
+        assert 0.05 * h < at.of(term.penetration) < 0.3 * h
+        Kv = times([(1.0, entries)], v)
+        low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
+        assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+        energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
+        assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
+        assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)
+
+
+def test_thin_walls_that_pass_through() -> None:
+    """Stretched walls may come nearer than half the undeformed thickness, and are then still apart."""
+    scene = sheets()
+    (term,), r0 = scene.model.touchings, scene.model.r0.x.array.reshape(-1, 3)
+    upper = r0[:, 2] > h / 2
+
+    def apart(d: float) -> Array:
+        u = r0 * [1.0, 1.0, 0.0]  # a quarter of h thick
+        u[upper, 2] = (d - 1) * h
+        return u
+
+    assert not term.through(apart(1.0), apart(0.26))
+    assert term.through(apart(0.3), apart(-0.3))
