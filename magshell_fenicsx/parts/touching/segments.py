@@ -116,8 +116,8 @@ class Pieces:
         most = max(3, int(there.sum(axis=1).max(initial=0)))
         first = np.argsort(~there, axis=1, kind="stable")[:, :most]
         corners = np.take_along_axis(ends.reshape(count, 2 * m, 2), first[..., None], axis=1)
-        there = np.take_along_axis(there, first, axis=1)
-        return Pieces(self.cell, self.faces, np.where(there[..., None], corners, corners[:, :1]))
+        kept = np.take_along_axis(there, first, axis=1)
+        return Pieces(self.cell, self.faces, np.where(kept[..., None], corners, corners[:, :1]))
 
 
 def area(corners: Array) -> Array:
