@@ -105,7 +105,7 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         If one does.
     """
     model, comm = stage.scene.model, stage.scene.comm
-    if not model.touchings:
+    if model.axisymmetric or not model.touchings:
         return
     ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
     whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
