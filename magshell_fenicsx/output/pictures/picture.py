@@ -202,21 +202,16 @@ def rims(surface: Surface) -> Array:
         np.sort(place.ravel()[edges[:, [0, -1]]], axis=1), axis=0, return_index=True, return_counts=True
     )
     lines = (surface.r0 + surface.u)[edges[first[count == 1]]]
-    ended = np.concatenate([_divided_each(lines), np.full((len(lines), 1, 3), np.nan)], axis=1)
+    at, nodes = np.linspace(0, 1, DIVISION * (inner + 1) + 1), np.linspace(0, 1, inner + 2)
+    table = np.vander(at, inner + 2) @ np.linalg.inv(np.vander(nodes))  # of the shape functions along an edge
+    ended = np.concatenate([table @ lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
     return np.asarray(ended.reshape(-1, 3))
-
-
-def _divided_each(lines: Array) -> Array:
-    """Lines (m, k, 3) with places between their own."""
-    at = np.arange(DIVISION * (lines.shape[1] - 1) + 1) / DIVISION
-    before = np.minimum(at.astype(int), lines.shape[1] - 2)
-    part = (at - before)[None, :, None]
-    return np.asarray((1 - part) * lines[:, before] + part * lines[:, before + 1])
 
 
 def _divided(line: Array) -> Array:
     """A line (n, 3) with places between its own."""
-    return np.asarray(_divided_each(line[None])[0])
+    at = np.arange(DIVISION * (len(line) - 1) + 1) / DIVISION
+    return np.column_stack([np.interp(at, np.arange(len(line)), x) for x in line.T])
 
 
 def silhouette(seen: InView) -> list[Array]:
