@@ -131,7 +131,7 @@ class Far:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
         np.add.at(M, self._leaf.of_cell, moments)
-        return self._leaf.of_cell, self.onto(M) / self._leaf.width
+        return self._leaf.of_cell, np.asarray(self.onto(M) / self._leaf.width, dtype=np.float64)
 
     def jacobian(self, at: Placed) -> Array:
         """(cells, COUNT, 3 k) derivatives of the moments of each cell's box by its nodes."""
@@ -225,7 +225,7 @@ def _each(B: Array, v: Array) -> Array:
 
 
 def _times(Z: Array, M: Array) -> Array:
-    return np.tensordot(M, Z, axes=(1, 1)).swapaxes(1, 2)
+    return np.asarray(np.tensordot(M, Z, axes=(1, 1)).swapaxes(1, 2), dtype=np.float64)
 
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
