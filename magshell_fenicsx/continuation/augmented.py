@@ -24,15 +24,11 @@ SOLVES = 25  # of the power iteration for a second eigenvalue near zero
 
 
 class Family(Protocol):
-    """Systems that differ by a number p, with the same unknowns.
+    """Systems that differ by a number p, with the same unknowns."""
 
-    Attributes
-    ----------
-    costly
-        Whether a system of another p is made anew: points are then taken at given p where that is possible.
-    """
-
-    costly: bool
+    @property
+    def costly(self) -> bool:
+        """Whether a system of another p is made anew: points are then taken at given p where that is possible."""
 
     def at(self, p: float) -> BorderedNewton:
         """The solver of the system at p; it may raise `NoSystem`."""
