@@ -144,8 +144,9 @@ class Case(WithParts):
         for key in LIKE_THE_SHELL:
             yield from numbers_with_units(getattr(self, key), data.get(key), key)
         shell = data.get("shell")
-        for key in ("imperfections", "defect") if isinstance(shell, Mapping) else ():
-            yield from numbers_with_units(getattr(self.shell, key, None), shell.get(key), f"shell.{key}")
+        if isinstance(shell, Mapping):
+            for key in ("imperfections", "defect"):
+                yield from numbers_with_units(getattr(self.shell, key, None), shell.get(key), f"shell.{key}")
 
     @model_validator(mode="after")
     def _abilities_fit(self) -> Self:
