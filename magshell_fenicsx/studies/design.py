@@ -233,7 +233,8 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     by_first(comm, drawn)
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
-    for target in [*wanted.targets.values()] or [None]:
+    targets: Sequence[Callable[[Array], Array] | None] = [*wanted.targets.values()] or [None]
+    for target in targets:
         by_first(comm, partial(_draw_reached, drawn, folder / "verified", target))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):

@@ -153,7 +153,7 @@ def test_nearest_places() -> None:
     model, term = ring().model, touching()
     at = model.system.at(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
     h, cells, points = model.material.h, term._cells, term._rule
-    places = at.of(lambda: term._found(term._now(), 4 * h))
+    places = at.of(lambda: term._facing.found(term._now(), 4 * h))
     r = at.of(lambda: term._r0 + term._now())
     x, n = term._x(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n

@@ -231,7 +231,7 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
         written.append(_beside(np.array([x, y]), size, written))
-        axes.text(*written[-1], f"$e_{number}$", ha="center", va="center")
+        axes.text(float(written[-1][0]), float(written[-1][1]), f"$e_{number}$", ha="center", va="center")
 
 
 def _beside(end: Array, size: float, others: Sequence[Array]) -> Array:

@@ -136,9 +136,9 @@ def add_shapes(
     on = [next((i for i in range(len(parts) - 1, -1, -1) if row in parts[i].rows), None) for row, _ in shapes]
     factor = magnification([surface for _, surface in shapes])
     moved = [replace(surface, u=factor * surface.u) for _, surface in shapes]
-    for number in dict.fromkeys(i for i in on if i is not None) if factor > 1 else ():
-        before = f"{figure.axes[number].get_title()}; " if figure.axes[number].get_title() else ""
-        figure.axes[number].set_title(rf"{before}displacements of shapes $\times$ {factor:g}")
+    for drawn_on in dict.fromkeys(i for i in on if i is not None) if factor > 1 else ():
+        before = f"{figure.axes[drawn_on].get_title()}; " if figure.axes[drawn_on].get_title() else ""
+        figure.axes[drawn_on].set_title(rf"{before}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()
     everything, taken = camera(np.concatenate([s.r0 + s.u for s in moved])), dict[int, list[Array]]()
     for number, (row, _), surface in zip(on, shapes, moved, strict=True):

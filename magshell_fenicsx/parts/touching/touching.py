@@ -17,7 +17,7 @@ less H(x), plus h, so that |x - y| need not be the least. H follows from the dis
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -28,9 +28,8 @@ from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
+from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.nearest import (
-    BESIDE,
-    BULGE,
     SIGNS,
     Cells,
     Joined,
@@ -38,21 +37,14 @@ from magshell_fenicsx.parts.touching.nearest import (
     Places,
     inverse,
     jets,
-    near_pairs,
     slopes,
 )
-from magshell_fenicsx.parts.touching.nearest import project as projected
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
-MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
-BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
-MANY = 100_000  # pairs of a point and a cell at a time
 CHUNK = 1000  # blocks of a tangent at a time
-BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `Joined`
-SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
 PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
@@ -107,15 +99,14 @@ class Touching:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
         self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
-        self._cells, self._rule, self._segments, self._allowed, self._h = cells, rule, segments, allowed, h
+        self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
-        self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._cuts = Cuts(segments, self._near, r0)
-        self._points, self._places = rule, _none()
+        self._points, self._places = rule, nowhere()
         self._joined = Joined.of(self._places, 1.0)
-        self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     # as a term
 
@@ -184,7 +175,7 @@ class Touching:
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self._found(self._now(), REACH * self._h, self._points)
+        places = self._facing.found(self._now(), REACH * self._h, self._points)
         least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
         return least - self._h if np.isfinite(least) else np.nan
 
@@ -199,7 +190,7 @@ class Touching:
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
-            x = self._x(self._points, self._r0 + self._now())[at.point[worst]]
+            x = self._facing.x_of(self._points, self._r0 + self._now())[at.point[worst]]
             mine = (float(self._h - at.distance[worst]), x)
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
@@ -216,7 +207,7 @@ class Touching:
         weight[: len(np.unique(points.cell))] -= 1.0
         pressed = at.point[joined.first]
         np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
-        near = self._found(self._now(), REACH * self._h, points)
+        near = self._facing.found(self._now(), REACH * self._h, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
@@ -233,10 +224,10 @@ class Touching:
         moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
-        if not self._near_on_way(u, v):
+        if not self._facing.near_on_way(u, v):
             return False
         for k in range(1, looks):
-            near = self._found(u + k / looks * (v - u), NEARER * least, faces=False)
+            near = self._facing.found(u + k / looks * (v - u), NEARER * least, faces=False)
             if self._comm.allreduce(len(near.point)):
                 return True
         return False
@@ -254,7 +245,7 @@ class Touching:
         if astray <= ASTRAY:
             return None
         points = self._cuts.at(u)
-        places = self._found(u, self._h, points)
+        places = self._facing.found(u, self._h, points)
         nearest = places.of(Joined.of(places, BLUR * self._h).first)
         pressures = penalty(self._h - nearest.distance, self.stiffness.value, SOFT * self._h)[1]
         return self._cuts.numbered(u) if self._astray(points, nearest, pressures) < astray / 2 else None
@@ -268,22 +259,13 @@ class Touching:
     def _near(self, u: Array) -> Places:
         """The places in all cells that may press on cells of this rank at a displacement."""
         far = self._h + self._segments.within
-        near = self._places_in(self._rule, u, self._placed(u), float(far.max()))
+        near = self._facing.places_in(self._rule, u, self._facing.placed(u), float(far.max()))
         return near.of(near.distance < far[self._rule.cell[near.point]])
 
     # geometry
 
     def _now(self) -> Array:
         return self._u()
-
-    def _placed(self, u: Array, *, faces: bool = True) -> Array:
-        """All nodes, with half of what the thickness gains as a fourth component if it changes; see `nearest`."""
-        r = self._r0 + u
-        return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
-
-    def _x(self, points: Points, r: Array) -> Array:
-        nodal = r[self._cells.nodes[points.cell]] * SIGNS[: r.shape[1]]
-        return np.asarray(np.einsum("nk,nki->ni", points.shape, nodal))
 
     def _forces(self) -> Array:
         """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
@@ -302,7 +284,7 @@ class Touching:
         points = self._cuts.points(self.cuts.value, u)
         if points is not self._points or not np.array_equal(u, self._at):
             self._points = points
-            self._places, self._at = self._found(u, (1 + SAME) * self._h, points), np.array(u)
+            self._places, self._at = self._facing.found(u, (1 + SAME) * self._h, points), np.array(u)
             self._joined = Joined.of(self._places, BLUR * self._h)
         joined = self._joined
         return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
@@ -336,7 +318,7 @@ class Touching:
         """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
         d, n, beta, nodes = self._geometry(at)
         half, parts = nodes.shape[1] // 2, self._parts
-        shapes, y = zip(*jets(self._cells.element, at.X, self._placed(self._at)[nodes[:, half:]]), strict=True)
+        shapes, y = zip(*jets(self._cells.element, at.X, self._facing.placed(self._at)[nodes[:, half:]]), strict=True)
         normal = np.column_stack([n, 0 * d])[:, None, :parts]
         off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :parts]
         A = slopes(off[:, 0], *y[1:])[1]
@@ -357,113 +339,3 @@ class Touching:
         for i in range(3):
             H[:, i::parts, i::parts] -= both
         return H, nodes
-
-    def _near_on_way(self, u: Array, v: Array) -> bool:
-        """Whether any cells that may touch come near each other between two displacements; collective."""
-        both = [self._spheres(self._r0 + each) for each in (u, v)]
-        centres = (both[0][0] + both[1][0]) / 2
-        apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
-        radii = np.maximum(both[0][1], both[1][1]) + apart
-        near = self._fit(*near_pairs(centres, radii, self._h))
-        return bool(self._comm.allreduce(len(near[0])))
-
-    def _spheres(self, r: Array) -> tuple[Array, Array]:
-        """Centres and radii of spheres around all cells."""
-        nodal = r[self._cells.nodes]
-        centres = nodal.mean(axis=1)
-        return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-
-    def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
-        """The pairs of cells that may touch."""
-        keys = i * len(self._cells.nodes) + j
-        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
-        fits = (self._beside[at] != keys) & self._allowed(i, j)
-        return i[fits], j[fits]
-
-    def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
-        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
-        if reach in self._tracked:
-            then, margin, pairs = self._tracked[reach]
-            moved = 2 * float(np.linalg.norm(u - then, axis=1).max(initial=0.0))
-            if moved + reach <= margin:
-                return pairs
-        centres, radii = self._spheres(self._r0 + u)
-        margin = reach + MARGIN * float(radii.mean())
-        i, j = self._fit(*near_pairs(centres, radii, margin))
-        mine = np.zeros(len(centres), dtype=bool)
-        mine[self._rule.cell] = True
-        pairs = i[mine[i]], j[mine[i]]
-        self._tracked[reach] = np.array(u), margin, pairs
-        return pairs
-
-    def _found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
-        """The places that points, those of the rule if none are given, face at a displacement, within a distance of
-        faces or mid-surfaces."""
-        points, r = points or self._rule, self._placed(u, faces=faces)
-        return self._facing(points, self._places_in(points, u, r, reach), r[:, :3])
-
-    def _places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
-        """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
-        of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
-        i, j = self._near_cells(u, reach)
-        cells = self._cells
-        x, (centres, radii) = self._x(points, r), self._spheres(r[:, :3])
-        count = np.bincount(points.cell, minlength=len(cells.nodes))
-        order = np.argsort(points.cell, kind="stable")
-        firsts = np.concatenate([[0], np.cumsum(count)])
-        n = count[i]
-        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
-        close = np.linalg.norm(x[point, :3] - centres[cell], axis=1) < radii[cell] + reach
-        point, cell = point[close], cell[close]
-        if not len(point):
-            return _none()
-        X, shape = cells.lattice
-        used, which = np.unique(cell, return_inverse=True)
-        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
-        start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
-        for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
-            away = np.linalg.norm(spread[which[some]] - x[point[some], None, :3], axis=2)
-            start[some] = away.argmin(axis=1)
-            least[some] = away[np.arange(len(some)), start[some]]
-        close = least < reach + BETWEEN * radii[cell]
-        point, cell, start = point[close], cell[close], start[close]
-        if not len(point):
-            return _none()
-        at = Places(point, cell, *projected(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return at.of(at.distance < of_faces)
-
-    def _facing(self, points: Points, at: Places, r: Array) -> Places:
-        """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
-        has one on each side of its own surface at most."""
-        cells, number = self._cells, len(self._cells.nodes)
-        keys = at.point * number + at.cell
-        order = np.argsort(keys, kind="stable")
-        at, keys = at.of(order), keys[order]
-        on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
-        stays = np.ones(len(keys), dtype=bool)
-        for side in range(3):
-            beyond = cells.across[at.cell, side]
-            asked = on[:, side] & (beyond >= 0)
-            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
-            listed = keys[there] == at.point * number + beyond
-            nearer = at.distance[there] < at.distance - SAME * self._h
-            stays &= ~asked | (listed & ~nearer)
-        at = at.of(stays)
-        if not len(at.point):
-            return at
-        X = points.shape[at.point] @ cells.element.points  # the shape functions are exact for them
-        (_, x), (_, t1), (_, t2) = jets(cells.element, X, r[cells.nodes[points.cell[at.point]]], 1)
-        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        above = np.sum(np.cross(t1, t2) * (x - y), axis=1) > 0
-        at = replace(at, side=above.astype(np.int64))
-        order = np.lexsort((at.distance, at.side, at.point))
-        at = at.of(order)
-        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
-        least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
-        return at.of(at.distance < least + SAME * self._h)
-
-
-def _none() -> Places:
-    nothing = np.zeros(0, dtype=np.int64)
-    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)

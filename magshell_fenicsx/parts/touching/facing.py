@@ -1,0 +1,185 @@
+"""Which places of other cells the points of a surface face, at a displacement.
+
+A tree gives the cells that are near, which are kept while nodes move little; Newton's method the nearest place of each.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.touching.faces import Faces
+from magshell_fenicsx.parts.touching.nearest import (
+    BESIDE,
+    BULGE,
+    SIGNS,
+    Cells,
+    Longs,
+    Places,
+    jets,
+    near_pairs,
+    project,
+)
+from magshell_fenicsx.parts.touching.segments import Points
+
+Array = NDArray[np.float64]
+MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
+BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
+MANY = 100_000  # pairs of a point and a cell at a time
+BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
+SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
+
+
+class Facing:
+    """The search for these places.
+
+    Parameters
+    ----------
+    rule
+        Points on all cells of this rank.
+    allowed
+        Whether points of cells (n,) may touch cells (n,).
+    h
+        Thickness over R.
+    r0
+        (nodes, 3) undeformed.
+    faces
+        How far they are from the mid-surface where the thickness changes with the state; None where it does not.
+    """
+
+    def __init__(
+        self,
+        cells: Cells,
+        rule: Points,
+        allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
+        h: float,
+        r0: Array,
+        faces: Faces | None,
+        comm: MPI.Comm,
+    ) -> None:
+        self._cells, self._rule, self._allowed, self._h = cells, rule, allowed, h
+        self._r0, self._faces, self._comm = r0, faces, comm
+        self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
+
+    def placed(self, u: Array, *, faces: bool = True) -> Array:
+        """All nodes, with half of what the thickness gains as a fourth component if it changes; see `nearest`."""
+        r = self._r0 + u
+        return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
+
+    def x_of(self, points: Points, r: Array) -> Array:
+        nodal = r[self._cells.nodes[points.cell]] * SIGNS[: r.shape[1]]
+        return np.asarray(np.einsum("nk,nki->ni", points.shape, nodal))
+
+    def near_on_way(self, u: Array, v: Array) -> bool:
+        """Whether any cells that may touch come near each other between two displacements; collective."""
+        both = [self._spheres(self._r0 + each) for each in (u, v)]
+        centres = (both[0][0] + both[1][0]) / 2
+        apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
+        radii = np.maximum(both[0][1], both[1][1]) + apart
+        near = self._fit(*near_pairs(centres, radii, self._h))
+        return bool(self._comm.allreduce(len(near[0])))
+
+    def _spheres(self, r: Array) -> tuple[Array, Array]:
+        """Centres and radii of spheres around all cells."""
+        nodal = r[self._cells.nodes]
+        centres = nodal.mean(axis=1)
+        return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+
+    def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
+        """The pairs of cells that may touch."""
+        keys = i * len(self._cells.nodes) + j
+        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
+        fits = (self._beside[at] != keys) & self._allowed(i, j)
+        return i[fits], j[fits]
+
+    def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
+        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
+        if reach in self._tracked:
+            then, margin, pairs = self._tracked[reach]
+            moved = 2 * float(np.linalg.norm(u - then, axis=1).max(initial=0.0))
+            if moved + reach <= margin:
+                return pairs
+        centres, radii = self._spheres(self._r0 + u)
+        margin = reach + MARGIN * float(radii.mean())
+        i, j = self._fit(*near_pairs(centres, radii, margin))
+        mine = np.zeros(len(centres), dtype=bool)
+        mine[self._rule.cell] = True
+        pairs = i[mine[i]], j[mine[i]]
+        self._tracked[reach] = np.array(u), margin, pairs
+        return pairs
+
+    def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
+        """The places that points, those of the rule if none are given, face at a displacement, within a distance of
+        faces or mid-surfaces."""
+        points, r = points or self._rule, self.placed(u, faces=faces)
+        return self._facing(points, self.places_in(points, u, r, reach), r[:, :3])
+
+    def places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
+        """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
+        of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
+        i, j = self._near_cells(u, reach)
+        cells = self._cells
+        x, (centres, radii) = self.x_of(points, r), self._spheres(r[:, :3])
+        count = np.bincount(points.cell, minlength=len(cells.nodes))
+        order = np.argsort(points.cell, kind="stable")
+        firsts = np.concatenate([[0], np.cumsum(count)])
+        n = count[i]
+        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
+        close = np.linalg.norm(x[point, :3] - centres[cell], axis=1) < radii[cell] + reach
+        point, cell = point[close], cell[close]
+        if not len(point):
+            return nowhere()
+        X, shape = cells.lattice
+        used, which = np.unique(cell, return_inverse=True)
+        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
+        start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
+        for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
+            away = np.linalg.norm(spread[which[some]] - x[point[some], None, :3], axis=2)
+            start[some] = away.argmin(axis=1)
+            least[some] = away[np.arange(len(some)), start[some]]
+        close = least < reach + BETWEEN * radii[cell]
+        point, cell, start = point[close], cell[close], start[close]
+        if not len(point):
+            return nowhere()
+        at = Places(point, cell, *project(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
+        return at.of(at.distance < of_faces)
+
+    def _facing(self, points: Points, at: Places, r: Array) -> Places:
+        """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
+        has one on each side of its own surface at most."""
+        cells, number = self._cells, len(self._cells.nodes)
+        keys = at.point * number + at.cell
+        order = np.argsort(keys, kind="stable")
+        at, keys = at.of(order), keys[order]
+        on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
+        stays = np.ones(len(keys), dtype=bool)
+        for side in range(3):
+            beyond = cells.across[at.cell, side]
+            asked = on[:, side] & (beyond >= 0)
+            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            listed = keys[there] == at.point * number + beyond
+            nearer = at.distance[there] < at.distance - SAME * self._h
+            stays &= ~asked | (listed & ~nearer)
+        at = at.of(stays)
+        if not len(at.point):
+            return at
+        X = points.shape[at.point] @ cells.element.points  # the shape functions are exact for them
+        (_, x), (_, t1), (_, t2) = jets(cells.element, X, r[cells.nodes[points.cell[at.point]]], 1)
+        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
+        above = np.sum(np.cross(t1, t2) * (x - y), axis=1) > 0
+        at = replace(at, side=above.astype(np.int64))
+        order = np.lexsort((at.distance, at.side, at.point))
+        at = at.of(order)
+        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
+        return at.of(at.distance < least + SAME * self._h)
+
+
+def nowhere() -> Places:
+    """No places."""
+    nothing = np.zeros(0, dtype=np.int64)
+    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
