@@ -155,14 +155,14 @@ def test_nearest_places() -> None:
     h, cells, points = model.material.h, term._cells, term._rule
     places = at.of(lambda: term._facing.found(term._now(), 4 * h))
     r = at.of(lambda: term._r0 + term._now())
-    x, n = term._x(points, r), 40
+    x, n = term._facing.x_of(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
     inner = np.flatnonzero(np.abs(x[places.point, 0]) < 0.4)
     assert len(inner) > 300
     for k in inner[::20]:
         i = points.cell[places.point[k]]
-        _, far = term._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
+        _, far = term._facing._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
         least = np.linalg.norm(fine[far] - x[places.point[k]], axis=-1).min()
         assert places.distance[k] <= least + 1e-12
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
