@@ -103,6 +103,7 @@ def _draw_history(
     number, best = (
         np.array([row[key] for row in rows], dtype=kind) for key, kind in (("evaluation", int), ("best", bool))
     )
+    axes.xaxis.get_major_locator().set_params(integer=True)
     for i, result in enumerate(results):
         values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
         colour, wide = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)  # lines that lie on each other are all seen
