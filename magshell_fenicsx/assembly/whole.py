@@ -176,13 +176,13 @@ class WholeMatrix:
 
     def product(self, parts: Sequence[OfTerm], whole: Array) -> Array:
         """Terms times factors, supports too, with changes of all unknowns; of own unknowns. Collective."""
-        found = np.zeros(3 * self._owned)
+        product = np.zeros(3 * self._owned)
         for part in parts:
             others = part.acting.times_others(whole[:, None]).reshape(-1, 3)
-            found += part.factor * (part.stored @ whole + self._own(others).ravel())
+            product += part.factor * (part.stored @ whole + self._own(others).ravel())
             if part.left_out is not None:
-                found -= part.factor * (part.left_out @ whole)
-        return found
+                product -= part.factor * (part.left_out @ whole)
+        return product
 
     def times(self, terms: Sequence[tuple[float, WholeTerm]], v: Array) -> Array:
         """The terms' product with a vector, both with ghosts, which are zero in the product. Collective."""

@@ -385,10 +385,10 @@ def _write(
     programmes: Sequence[Programme],
 ) -> None:
     for each in programmes:
-        found = each.found(folder, done.fit, done.content["noise"])
-        done.content["programmes"][each.name] = found.content
-        done.content["said"] += found.said
-        found.write(folder)
+        predicted = each.found(folder, done.fit, done.content["noise"])
+        done.content["programmes"][each.name] = predicted.content
+        done.content["said"] += predicted.said
+        predicted.write(folder)
     write_object(folder / "identify.json", done.content)
     rows = done.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")

@@ -196,9 +196,9 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
 
 def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[str]) -> None:
     def label(text: str) -> str:
-        there = text in labels
+        is_new = text in labels
         labels.discard(text)
-        return text if there else ""
+        return text if is_new else ""
 
     def get(of: str) -> Array:
         return np.array([np.nan if row[of] == "" else row[of] for row in rows], dtype=float)

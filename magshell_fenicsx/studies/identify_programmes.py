@@ -156,8 +156,8 @@ class Programme:
         outcome = kept_outcome(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
             return None
-        known = not outcome.curve or self._needed.keys() <= outcome.curve[0].keys()
-        return outcome if known else None
+        complete = not outcome.curve or self._needed.keys() <= outcome.curve[0].keys()
+        return outcome if complete else None
 
     def found(self, folder: Path, fit: Fit, noise: Mapping[str, Mapping[str, Any]]) -> Found:
         """What the runs say.
@@ -340,17 +340,17 @@ def programme(
     steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     if section.data:
         place, places, steps, columns = _measured(source.folder / section.data, names, last, f"{where}.data")
-    there = {each.of for each in columns}
+    measured = {each.of for each in columns}
     for of in section.of:
         if "@" not in of and of in names.all:
             shown = names.shown(of)
-            columns += [] if shown in there else [Column(of, shown, np.zeros(0), change=False)]
+            columns += [] if shown in measured else [Column(of, shown, np.zeros(0), change=False)]
     scalars = [_scalar(of, where) for of in section.of if "@" in of or of not in names.all]
     if columns and not place:
         raise CaseError(f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown")
-    known = {text for each in columns for text in (each.header, each.of)}
-    if strange := next((of for of in section.changes if of not in known), None):
-        raise CaseError(f"{where}.changes: {strange}: is no column that is predicted; these are {', '.join(known)}")
+    predicted = {text for each in columns for text in (each.header, each.of)}
+    if strange := next((of for of in section.changes if of not in predicted), None):
+        raise CaseError(f"{where}.changes: {strange}: is no column that is predicted; these are {', '.join(predicted)}")
     columns = [replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns]
     return Programme(name, base, section.samples, made, last, place, places, steps, columns, scalars)
 
@@ -385,8 +385,8 @@ class _Names:
 
     def shown(self, name: str) -> str:
         """The column in units of a column, or itself."""
-        there = self.sizes.column(name)
-        return there.name if there else name
+        in_units = self.sizes.column(name)
+        return in_units.name if in_units else name
 
     def of(self, name: str, unit: str | None, where: str) -> tuple[str, float]:
         """The column of a name with a unit, and what one of that unit is in it.
@@ -422,8 +422,8 @@ def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Ar
     given = {header: values for header, values in columns.items() if header != "step"}
     if len(given) < 2:
         raise CaseError(f"{where}: needs two columns or more: the place first, then what was measured there")
-    found = [(header, *names.of(header, units[header], where), values) for header, values in given.items()]
-    (_, place, factor, at), *others = found
+    measured = [(header, *names.of(header, units[header], where), values) for header, values in given.items()]
+    (_, place, factor, at), *others = measured
     steps = np.asarray(columns.get("step", np.full(at.size, last)))
     if not (np.isfinite(at).all() and at.size and np.isin(steps, np.arange(1, last + 1)).all()):
         raise CaseError(f"{where}: a row has no place, or no step of 1 to {last}")

@@ -183,9 +183,9 @@ class Cells:
 
     def summed(self, f: Array) -> Array:
         """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
-        found = np.zeros((self.local, 3, f.shape[-1]))
-        np.add.at(found, self.rows, f.reshape(*self.rows.shape, 3, -1))
-        return found.reshape(3 * self.local, -1)
+        summed_up = np.zeros((self.local, 3, f.shape[-1]))
+        np.add.at(summed_up, self.rows, f.reshape(*self.rows.shape, 3, -1))
+        return summed_up.reshape(3 * self.local, -1)
 
 
 @dataclass(frozen=True)
@@ -214,9 +214,9 @@ class ActingOnEachOther:
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""
-        here = slice(self.cells.own.start, self.cells.own.stop)
+        own_cells = slice(self.cells.own.start, self.cells.own.stop)
         of_cell, onto = self.far.between(_each(self.B, self.cells.of_copies(v, self.sign)))
-        return self.scale * self.cells.summed(_each(self.B[here].transpose(0, 2, 1), onto[of_cell[here]]))
+        return self.scale * self.cells.summed(_each(self.B[own_cells].transpose(0, 2, 1), onto[of_cell[own_cells]]))
 
 
 def _each(B: Array, v: Array) -> Array:

@@ -51,7 +51,7 @@ def harmonics(x: Array) -> Array:
 @cache
 def derivatives() -> tuple[Array, Array, Array]:
     """The matrices N with dY/dx_i = N_i Y."""
-    found = [np.zeros((COUNT, COUNT)) for _ in range(3)]
+    matrices = [np.zeros((COUNT, COUNT)) for _ in range(3)]
     along, rest = _complex()
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
@@ -60,10 +60,10 @@ def derivatives() -> tuple[Array, Array, Array]:
         up, down, same = (along.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
         for i, row in enumerate(((up - down) / 2, (up + down) / 2j, same)):
             at = place_of(degree, m)
-            found[i][at] = row.real
+            matrices[i][at] = row.real
             if m:
-                found[i][at + 1] = row.imag
-    return found[0], found[1], found[2]
+                matrices[i][at + 1] = row.imag
+    return matrices[0], matrices[1], matrices[2]
 
 
 def _complex() -> tuple[dict[tuple[int, int], NDArray[np.complex128]], NDArray[np.complex128]]:

@@ -142,8 +142,10 @@ class Stiffness:
 
     def matrix(self, sign: float) -> bsr_array:
         """(3 local nodes, 3 all nodes), with the columns of images times the sign."""
-        here, there = self.blocks[: self._count], self.blocks[self._count :]
-        return bsr_array((here + sign * there if len(there) else here, self._columns, self._starts), self._shape)
+        of_itself, of_images = self.blocks[: self._count], self.blocks[self._count :]
+        return bsr_array(
+            (of_itself + sign * of_images if len(of_images) else of_itself, self._columns, self._starts), self._shape
+        )
 
 
 class Pairs:

@@ -106,13 +106,13 @@ class Grid:
         keys, levels = self._keys(places), list[Level]()
         pairs: Ints = np.zeros((0, 2), dtype=np.int64)
         grids = [np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)]) for k in range(self._depth + 1)]
-        found, before = list[tuple[Ints, Ints, Array, float]](), None
+        boxes_of_levels, before = list[tuple[Ints, Ints, Array, float]](), None
         for k, grid in enumerate(grids):
             boxes, of_cell = np.unique(grid, axis=0, return_inverse=True)
             width = self._size / 2**k
-            found.append((boxes, of_cell.reshape(-1), self._origin + (boxes[:, 2:] + 0.5) * width, width))
+            boxes_of_levels.append((boxes, of_cell.reshape(-1), self._origin + (boxes[:, 2:] + 0.5) * width, width))
         offsets: dict[tuple[int, ...], int] = {}
-        for k, (boxes, of_cell, middle, width) in enumerate(found):
+        for k, (boxes, of_cell, middle, width) in enumerate(boxes_of_levels):
             own = np.zeros(len(boxes), dtype=bool)
             own[of_cell[self._own.start : self._own.stop]] = True
             radius = np.zeros(len(boxes))
@@ -122,7 +122,7 @@ class Grid:
                 pairs = np.stack(np.meshgrid(*2 * [np.arange(len(boxes))], indexing="ij"), axis=-1).reshape(-1, 2)
             else:
                 parent = np.empty(len(boxes), dtype=np.int64)
-                parent[of_cell] = found[k - 1][1]
+                parent[of_cell] = boxes_of_levels[k - 1][1]
                 pairs = _children(pairs, parent, len(before))
             pairs = pairs[own[pairs[:, 0]]]
             if not self._itself:
@@ -135,7 +135,7 @@ class Grid:
             order = np.argsort(which, kind="stable")
             levels.append(Level(width, boxes, middle, of_cell, parent, one[order], other[order], which[order]))
             before = boxes
-        of_cell, count = found[-1][1], len(found[-1][0])
+        of_cell, count = boxes_of_levels[-1][1], len(boxes_of_levels[-1][0])
         beside = np.zeros((count, count), dtype=bool)
         beside[pairs[:, 0], pairs[:, 1]] = True
         near: NDArray[np.bool_] = beside[of_cell[self._own.start : self._own.stop, None], of_cell]
