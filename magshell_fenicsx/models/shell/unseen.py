@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 AT_ONCE = 4096  # parts that are evaluated together
 OPEN = 5e-3  # of the integral of the variation: what ranges may leave open
+SLIGHT = 1e-4  # of the integral of |f|: so little may be open whatever the variation, as of a step at a rim
 BOTH = 0.9  # of the difference of values: both sides of a step are seen, and little is left open
 ALIKE = 8.0  # times what values show: derivatives that differ less hide nothing
 SHARE = 0.03  # of the largest part of that: what is divided now, before others
@@ -157,9 +158,10 @@ def leaves(
         unseen = np.where(matters, seen.area * seen.between, 0.0)
         most = comm.allreduce(float(unseen[own].max(initial=0.0)), MPI.MAX)
         left = comm.allreduce(float(unseen[own].sum()))
+        slight = SLIGHT * comm.allreduce(float(area @ np.linalg.norm(seen.values, axis=-1).mean(axis=1)))
         alike = OPEN * variation / max(comm.allreduce(int(own.sum())), 1)
         again = (unseen > alike) & (unseen >= SHARE * min(most, np.finfo(float).max))
-        if left <= OPEN * variation or looked > MOST or not comm.allreduce(int((again & own).sum())):
+        if left <= max(OPEN * variation, slight) or looked > MOST or not comm.allreduce(int((again & own).sum())):
             break
         smaller = parts[again].divided()
         parts = Parts.together([parts[~again], smaller])
