@@ -222,7 +222,7 @@ def test_defect_is_one_of_them() -> None:
         ("hemisphere", [{"kind": "formula", "w0": "1/z"}], "has no finite value"),
         ("holed cap", [towards(12.0)], "it would reach around the shell or its axis"),
         ("hemisphere", [dimple(at={"polar": 3.0, "point": [0.0, 0.0, 1.0]})], "give a point, or polar and azimuth"),
-        ("hemisphere", [dimple(at={"point": ["0 mm", "0 mm", "1 mm"]})], r"0\.at\.point: has a unit"),
+        ("hemisphere", [dimple(at={"point": ["0 mm", "0 mm", "1 mm"]})], r"0\.at\.point\.0: has a unit"),
         ("hemisphere", [{"kind": "bump"}], r"imperfections\.0\.kind: 'bump'; allowed: dimple, gaussian, formula"),
         ("hemisphere", [dimple(widht=1.0)], "did you mean width"),
     ],
