@@ -38,8 +38,7 @@ def describe(case: Case, problem: Problem | None = None) -> str:
 
 def _described(case: Case, problem: Problem) -> str:
     too_large = None if case.mesh.tolerance else refuse_beyond_memory(problem)
-    needs_support = problem.programme or problem.frequencies is None
-    if needs_support and all(condition in ("free", "symmetry") for condition in problem.conditions.values()):
+    if not problem.at_rest and all(condition in ("free", "symmetry") for condition in problem.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
         "R/h": 1 / problem.material.h,

@@ -246,6 +246,11 @@ class Problem:
         return "clamped" in self.conditions.values()
 
     @property
+    def at_rest(self) -> bool:
+        """Whether nothing loads the shell and its frequencies alone are asked: it need not be held."""
+        return not self.programme and self.frequencies is not None
+
+    @property
     def imperfections(self) -> Mapping[str, ImperfectionSection]:
         """Key of each below `shell` -> its section."""
         return self.context.sections.get("imperfections") or {}

@@ -119,7 +119,7 @@ class Scene:
     warnings
         What is unphysical, or may be too large.
     loose
-        Whether rigid motions may be left free: those of a shell that nothing loads, which has frequencies.
+        Whether rigid motions may be left free: see `Problem.at_rest`.
     setup_s
         Time to build the scene in seconds, without compiling kernels.
     """
@@ -142,9 +142,9 @@ class Scene:
         surface = self.model.midsurface
         several = surface is not None and surface.read  # a file may have pieces, of which each must be held
         unsure = self.model.axisymmetric or several or not self.problem.fixed
-        if unsure and self.problem.programme and (motion := self.model.free_motion(self.unloaded().mu)):
+        self.loose = unsure and self.problem.at_rest
+        if unsure and not self.loose and (motion := self.model.free_motion(self.unloaded().mu)):
             raise MeshError(motion)
-        self.loose = unsure and not self.problem.programme
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
         options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts or self.model.touchings else None

@@ -88,7 +88,7 @@ class BoundarySection(Section, Ability):
         )
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """A half does not see rigid motions across its plane: if it is loaded, it needs a support against all."""
+        """A half that is loaded does not see rigid motions across its plane: it needs a support against all."""
         parts = list[Leaves]()
         for name, condition in self.conditions().items():
             reason = None
@@ -98,7 +98,8 @@ class BoundarySection(Section, Ability):
                 why = "is held along x or y alone" if one_sided else "is held off the axis" if off else None
                 reason = why and f"boundary.{name}: {why}"
             parts.append(Leaves(reason, mirrors=partial(self._mirrored, context, name)))
-        if context.steps and not self.fixes:  # a meridian asks for itself whether it is held
+        at_rest = not context.steps and context.sections.get("frequencies") is not None
+        if not at_rest and not self.fixes:  # a meridian asks for itself whether it is held
             parts.append(Leaves(mirrors=nothing))
         return parts
 
