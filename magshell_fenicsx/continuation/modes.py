@@ -205,10 +205,9 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
         If Lanczos does not converge, or Sylvester's law says that some eigenvalues stay hidden.
     """
     slices = _Slices(K, M)
-    zero = -slices.rounding if kernel else 0.0
-    wanted = min(max(count, kernel or slices.below(zero)), slices.finite)
+    wanted = min(max(count, kernel or slices.below(0.0)), slices.finite)
     # (a) the eigenvalues nearest to zero give the order of magnitude
-    nearest = slices.around(zero, wanted + kernel + 1, 1e-3)
+    nearest = slices.around(-slices.rounding if kernel else 0.0, wanted + kernel + 1, 1e-3)
     shift = -2 * max(abs(mode.eigenvalue) for mode in nearest)
     # (b) a shift with nothing below it
     trials = 0

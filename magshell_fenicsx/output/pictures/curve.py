@@ -25,6 +25,7 @@ from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import shown
+from magshell_fenicsx.shells.modes import TORSION
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -212,7 +213,6 @@ def _once(axes: "Axes", name: str) -> str:
     return "_" if name in axes.get_legend_handles_labels()[1] else name
 
 
-TORSION = "torsion"  # the wave of a frequency around the axis
 NAMED = 12  # most waves in the legend
 
 
