@@ -232,7 +232,7 @@ def refined_tangent(
     z, directions = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
     for _ in range(MOST_REFINEMENTS):
         if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-            return t
+            return plus(t, 1.0, z)  # one step of Richardson's for nothing
         p, q = z, times(z)
         for before, image, square in directions:
             part = matrix.inner(image, q) / square

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from math import prod
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end
 LOOKS = 2  # at a point that was found too far away; a third point before it means that it is on another branch
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
+LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -64,6 +66,17 @@ class _Far:
     reason: str
     exact: bool
     looks: int = 0
+
+
+def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
+    """What values and slopes at nodes count at `s`, on the polynomial that has them all."""
+    weights = []
+    for i, a in enumerate(nodes):
+        others = [*nodes[:i], *nodes[i + 1 :]]
+        square = prod((s - b) / (a - b) for b in others) ** 2
+        bend = 2 * sum(1 / (a - b) for b in others)
+        weights.append((square * (1 - bend * (s - a)), square * (s - a)))
+    return weights
 
 
 class NotANumber(RuntimeError):
@@ -213,15 +226,15 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        before, here, step, leaps, far = None, start, self.options.first, 0, None
+        passed, step, leaps, far = [start], self.options.first, 0, None
         for target in targets:
-            while here.s != target:
+            while (here := passed[-1]).s != target:
                 way = target - here.s
                 pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
-                length = min(length, self._past_fold(before, here, length))
+                length = min(length, self._past_fold(passed, length))
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
-                tried = self._try(s, before, here)
+                tried = self._try(s, passed)
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
                 if isinstance(tried, str):
@@ -238,7 +251,7 @@ class Path:
                     step = min(max(step, 1.5 * length), o.largest)
                 elif tried.factorisations >= o.hard:
                     step = 0.6 * length
-                before, here = here, tried
+                passed, here = [*passed[1 - LOOKED_BACK :], tried], tried
                 yield here, here.s == target
                 if not far:
                     continue
@@ -246,16 +259,17 @@ class Path:
                 length, far.looks = (again.s - here.s) * np.sign(way), far.looks + 1
                 solved = length > 0 and (far.exact or not again.turned_from(here))
                 if solved and not self._jumped(here, again := self.seen_from(here, again)):
-                    before, here, step, far = here, self.as_base(again), length, None
-                    yield here, here.s == target
+                    passed, step, far = [*passed[1 - LOOKED_BACK :], self.as_base(again)], length, None
+                    yield passed[-1], passed[-1].s == target
                 else:
                     step = min(step, max(length / 2, LEAST_PART * step)) if length > 0 else step
                     far = far if far.looks < LOOKS else None
 
-    def _past_fold(self, before: Point | None, here: Point, length: float) -> float:
+    def _past_fold(self, passed: Sequence[Point], length: float) -> float:
         """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
-        if before is None or self.control == "load":
+        if len(passed) < 2 or self.control == "load":
             return np.inf
+        before, here = passed[-2:]
         way, last = here.s - before.s, self.seen_from(before, here)
         mean = (here.state.mu[self.name] - before.state.mu[self.name]) / way
         # dmu/ds = first + b t + c t^2 has both slopes and their mean
@@ -264,21 +278,35 @@ class Path:
         turns = [float(t.real) for t in np.roots([c, b, first]) if abs(t.imag) < SEEN and t.real > 1]
         return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
 
-    def predict(self, s: float, before: Point | None, here: Point) -> State:
-        """Cubic through the last two points with their tangents (linear at the start)."""
-        if before is not None:
-            return self.between(s, before, here)
-        a = s - here.s
-        return here.state.with_(here.state.u + a * here.du, self.name, here.state.mu[self.name] + a * here.dmu)
+    def predict(self, s: float, passed: Sequence[Point]) -> State:
+        """A first guess at `s` from the last points: linear, cubic, or of fifth degree where that found the last one better."""
+        *earlier, here = passed
+        if not earlier:
+            return self._extended(s, passed)
+        quintic = len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
+        return self._extended(s, passed[-3:] if quintic else passed[-2:])
+
+    def _distance(self, passed: Sequence[Point], point: Point) -> float:
+        """How far a point is from where earlier ones led."""
+        guess = self._extended(self.measured_from(passed[-1], point).s, passed)
+        return max_abs(self.system.comm, guess.u - point.state.u)
+
+    def _extended(self, s: float, passed: Sequence[Point]) -> State:
+        """The state at `s` of the polynomial through points with their tangents; arc length is measured from the last."""
+        last = passed[-1]
+        seen = [self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]]
+        return self._joined(s, [*seen, last])
 
     def between(self, s: float, low: Point, high: Point) -> State:
         """A first guess at `s`: the Hermite cubic through two points."""
-        L, name = high.s - low.s, self.name
-        t = (s - low.s) / L
-        h00, h10, h01, h11 = 2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2
-        u = h00 * low.state.u + h01 * high.state.u + L * (h10 * low.du + h11 * high.du)
-        mu = h00 * low.state.mu[name] + h01 * high.state.mu[name] + L * (h10 * low.dmu + h11 * high.dmu)
-        return low.state.with_(u, name, float(mu))
+        return self._joined(s, [low, high])
+
+    def _joined(self, s: float, points: Sequence[Point]) -> State:
+        u, mu, last = np.zeros_like(points[0].du), 0.0, points[-1].state
+        for (value, slope), point in zip(hermite(s, [point.s for point in points]), points, strict=True):
+            u += value * point.state.u + slope * point.du
+            mu += value * point.state.mu[self.name] + slope * point.dmu
+        return last.with_(u, self.name, float(mu))
 
     def seen_from(self, base: Point, point: Point) -> Point:
         """The point with its tangent per unit of s, where s is measured from `base`."""
@@ -286,10 +314,11 @@ class Path:
             return point
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
 
-    def _try(self, s: float, before: Point | None, here: Point) -> Point | _Far | str:
+    def _try(self, s: float, passed: Sequence[Point]) -> Point | _Far | str:
         """The next point, or one that is too far away, or the reason why there is none."""
+        here = passed[-1]
         self.progress.trying(here, s - here.s)
-        point = self.at(s, self.predict(s, before, here), here)
+        point = self.at(s, self.predict(s, passed), here)
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
