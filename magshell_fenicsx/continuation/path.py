@@ -23,6 +23,7 @@ LOOKS = 2  # at a point that was found too far away; a third point before it mea
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
+GUESSED, WORSE = 0.05, 2.0  # in lengths, and beside that of the step before: errors of a first guess that shorten no step
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -233,6 +234,7 @@ class Path:
                 pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 length = min(length, self._past_fold(passed, length))
+                length *= self._foreseen(passed, here.s + np.copysign(length, way))
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 tried = self._try(s, passed)
                 if isinstance(tried, _Far):
@@ -285,6 +287,16 @@ class Path:
             return self._extended(s, passed)
         quintic = len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
         return self._extended(s, passed[-3:] if quintic else passed[-2:])
+
+    def _foreseen(self, passed: Sequence[Point], s: float) -> float:
+        """The part of a step to `s` whose first guess is about as good as that of the last step, or good enough."""
+        if len(passed) <= 3:
+            return 1.0
+        *earlier, here = passed
+        cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
+        error = max_abs(self.system.comm, quintic - cubic)
+        allowed = max(GUESSED * self.system.length, WORSE * self._distance(earlier[-2:], here))
+        return min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:
         """How far a point is from where earlier ones led."""
