@@ -19,6 +19,7 @@ from magshell_fenicsx.continuation.system import Direction, State, System, Vecto
 MOST_REFINEMENTS = 4
 REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
 DIFFERENCE = 1e-5  # in lengths: the step of the differences that replace K times a vector
+COARSE = 1e-4  # beside a tangent: a correction that such differences give well
 LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
 
 
@@ -232,7 +233,7 @@ def refined_tangent(
     z, directions = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
     for _ in range(MOST_REFINEMENTS):
         if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-            return plus(t, 1.0, z)  # one step of Richardson's for nothing
+            return plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
         p, q = z, times(z)
         for before, image, square in directions:
             part = matrix.inner(image, q) / square
