@@ -3,7 +3,7 @@
 The bordered matrix is inverted by block elimination; Broyden's update goes on with it at later iterates.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -180,40 +180,49 @@ class Bordered:
         return self._factors.times(du) + dmu * self.column, slope(self._comm, self._gradient, (du, dmu))
 
 
-class Chord:
-    """A bordered matrix that is kept over several iterates, with Broyden's update after each step.
+class Chord[V]:
+    """A matrix that is kept over several iterates, with Broyden's update after each step.
 
     C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.
     Steps are subtracted.
+
+    Parameters
+    ----------
+    solve
+        The inverse of the matrix, times a right side.
+    inner, plus
+        Inner product in which the update is the smallest, and a + factor b.
     """
 
-    def __init__(self, matrix: Bordered) -> None:
-        self.matrix = matrix
-        self._steps = list[Direction]()  # those taken since the matrix was made
+    def __init__(
+        self, solve: Callable[[V], V], inner: Callable[[V, V], float], plus: Callable[[V, float, V], V]
+    ) -> None:
+        self._solve, self._inner, self._plus = solve, inner, plus
+        self._steps = list[V]()  # those taken since the matrix was made
 
-    def took(self, step: Direction) -> None:
+    def took(self, step: V) -> None:
         """Go on to the next iterate by a full step."""
         self._steps.append(step)
 
-    def step(self, f: Direction) -> Direction:
+    def step(self, f: V) -> V:
         """The next step at the present iterate, whose residual is `f`."""
-        step, inner = self._updated(f, self._steps), self.matrix.inner
+        step, inner = self._updated(f, self._steps), self._inner
         if self._steps:
             last = self._steps[-1]
             rest = 1 - inner(last, step) / inner(last, last)
             if rest > LEAST_REST:
-                return plus(step, 1 / rest - 1, step)
+                return self._plus(step, 1 / rest - 1, step)
             self._steps.clear()
         return step
 
-    def solve(self, f: Direction, step: Direction) -> Direction:
+    def solve(self, f: V, step: V) -> V:
         """The solution for any right side at the present iterate, from which `step` is the next one."""
         return self._updated(f, [*self._steps, step])
 
-    def _updated(self, f: Direction, steps: Sequence[Direction]) -> Direction:
-        solution, inner = self.matrix.solve(*f), self.matrix.inner
+    def _updated(self, f: V, steps: Sequence[V]) -> V:
+        solution, inner = self._solve(f), self._inner
         for before, after in pairwise(steps):
-            solution = plus(solution, inner(before, solution) / inner(before, before), after)
+            solution = self._plus(solution, inner(before, solution) / inner(before, before), after)
         return solution
 
 

@@ -186,7 +186,8 @@ class Linearised:
         self._tangents, self._system, self._options = tangents, tangents.system, options
         comm = self._system.comm
         self._last = comm.rank == comm.size - 1
-        self._chord: Chord | None = None
+        self.matrix: Bordered | None = None  # of the present solve, or of the last
+        self._chord: Chord[Direction] | None = None
         self._state: State | None = None
         self._ahead: Direction | None = None
 
@@ -195,13 +196,8 @@ class Linearised:
         self._tolerance = tolerance
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         self._iterates = Iterates(self._options.largest_step, self._options.patience)
-        self._chord = self._state = self._ahead = None
+        self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
-
-    @property
-    def matrix(self) -> Bordered | None:
-        """The bordered matrix of the present solve, or of the last."""
-        return self._chord.matrix if self._chord else None
 
     @property
     def error(self) -> float:
@@ -272,15 +268,16 @@ class Linearised:
     def _next_step(self, state: State, f: Direction) -> Direction:
         """The next step, which SNES subtracts: from the latest matrix, or from a new one at this iterate."""
         steps = self._iterates.steps
-        if self._chord:
+        if self._chord and self.matrix:
             step = self._chord.step(f)
-            size = self._chord.matrix.size(step)
+            size = self.matrix.size(step)
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
         factors = self._tangents.at(state, self._stress, rough=True)
         matrix = Bordered(self._system, factors, state, self._name, self._row)
-        self._chord, step = Chord(matrix), matrix.solve(*f)
+        self.matrix, step = matrix, matrix.solve(*f)
+        self._chord = Chord(lambda f: matrix.solve(*f), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=True))
         return step
 

@@ -8,11 +8,13 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.continuation.control import Chord
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
 from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
@@ -231,10 +233,12 @@ class Integrator:
         if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
+        chord = self._chord()
         for _ in range(MOST):
             a, v = self._rates(now, u, dt)
-            d = self.factorisation.solve(pull + self._unbalanced(now, u, y, v, a, dt))
-            d, dy = split(d, y.size, comm)
+            step = chord.step(pull + self._unbalanced(now, u, y, v, a, dt))
+            chord.took(step)
+            d, dy = split(step, y.size, comm)
             u, y = u - d, y - dy
             self.iterations += 1
             size = max_abs(comm, d) / self.system.length
@@ -250,10 +254,15 @@ class Integrator:
                 if grown > (PATIENCE if self.averaged else 0):
                     break
                 self._factor(now, u, y, dt)
-                fresh = True
+                fresh, chord = True, self._chord()
             last = size
         self.factored = None
         return "Newton's method does not converge"
+
+    def _chord(self) -> Chord[Vector]:
+        """The latest factors, which Broyden's update carries from iterate to iterate."""
+        comm = self.system.comm
+        return Chord(self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b)
 
     def _pull(self, now: Motion, dt: float) -> Vector:
         """The forces of inertia and drag by moving supports in a step, with zeros for unknown amplitudes."""
