@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import sqrt
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -21,6 +21,8 @@ REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
 DIFFERENCE = 1e-5  # in lengths: the step of the differences that replace K times a vector
 COARSE = 1e-4  # beside a tangent: a correction that such differences give well
 LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
+
+V = TypeVar("V")
 
 
 class Row(Protocol):
@@ -180,7 +182,7 @@ class Bordered:
         return self._factors.times(du) + dmu * self.column, slope(self._comm, self._gradient, (du, dmu))
 
 
-class Chord[V]:
+class Chord(Generic[V]):
     """A matrix that is kept over several iterates, with Broyden's update after each step.
 
     C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.

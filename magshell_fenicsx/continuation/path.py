@@ -23,7 +23,8 @@ LOOKS = 2  # at a point that was found too far away; a third point before it mea
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
-GUESSED, WORSE = 0.05, 2.0  # in lengths, and beside that of the step before: errors of a first guess that shorten no step
+GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
+WORSE = 2.0  # the same beside the error of the last guess
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -281,7 +282,7 @@ class Path:
         return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
 
     def predict(self, s: float, passed: Sequence[Point]) -> State:
-        """A first guess at `s` from the last points: linear, cubic, or of fifth degree where that found the last one better."""
+        """A first guess at `s`: linear, cubic, or quintic where that would have found the last point better."""
         *earlier, here = passed
         if not earlier:
             return self._extended(s, passed)
@@ -304,7 +305,7 @@ class Path:
         return max_abs(self.system.comm, guess.u - point.state.u)
 
     def _extended(self, s: float, passed: Sequence[Point]) -> State:
-        """The state at `s` of the polynomial through points with their tangents; arc length is measured from the last."""
+        """A state at `s`, of the polynomial through points with their tangents; arc length is from the last."""
         last = passed[-1]
         seen = [self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]]
         return self._joined(s, [*seen, last])
