@@ -22,6 +22,7 @@ BESIDE = 0.5  # of the way between two points: what is farther from their cubic 
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 MOST_STEPS = 1000
+LOCATED = 1e-8  # relative: of the amplitude at an instability
 SAME = 1e-2  # distance along the path, in the system's lengths, below which two folds are one
 
 
@@ -39,7 +40,7 @@ class Instability:
     kind: Literal["fold", "bifurcation"]
 
 
-def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
+def instabilities(path: Path, low: Point, high: Point, tolerance: float = LOCATED) -> Iterator[Instability]:
     """All singular points between two successive points, in order, as far as inertia and tangents reveal them.
 
     Parameters
@@ -263,7 +264,7 @@ def _stationary(low: Point, high: Point, name: str) -> float:
 
 
 def locate_bifurcation(
-    path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = 1e-8
+    path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = LOCATED
 ) -> Point:
     """Where a tangent other than the path's own becomes singular, between two successive points.
 

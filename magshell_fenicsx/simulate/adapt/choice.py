@@ -10,6 +10,7 @@ import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.walk import LOCATED
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene
@@ -142,7 +143,8 @@ class Adapted:
             Result of the run (`Ending.value`), or None.
         """
         best, least = self.best, min(self.rounds, key=lambda each: each.estimate)
-        same = result is not None and abs(result - best.result) <= best.estimate * abs(best.result)
+        apart = max(best.estimate, LOCATED) * abs(best.result)
+        same = result is not None and abs(result - best.result) <= apart
         return {
             "tolerance": self.asked.mesh.tolerance,
             "error_estimate": best.estimate if same else None,
