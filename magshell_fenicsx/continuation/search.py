@@ -54,6 +54,7 @@ LEAP, MOST_LEAPS = 1.0, 4  # in lengths of the system: a step over it
 FORCE = "holding force"
 FIRST, LONGEST, SHORTEST = 0.02, 1000.0, 1e-3  # steps: the first in the metric's length, others over the first
 MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
+MOST_BRACKETS, LITTLE = 4, 1e-2  # solves until a force that changes its sign is so small beside its change
 SCALE = 1e6  # the force counts as nothing in the arc length
 MOST_FACTORS = 40
 UNEXPLAINED = 0.7  # part of the residual that a step towards rest may leave
@@ -189,14 +190,27 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
         for count, (point, _) in enumerate(path.towards(reached, [np.inf]), 1):
             before, after = (p.state.mu[FORCE] for p in (reached, point))
             if before * after <= 0 and before != after:
-                s = reached.s + (point.s - reached.s) * before / (before - after)
-                near = path.between(s, reached, path.seen_from(reached, point))
-                yield State(near.u, dict(guess.mu))
+                yield State(_at_rest(path, reached, path.seen_from(reached, point)).u, dict(guess.mu))
             reached = point
             if count == MOST_STEPS or abs(after) > largest:
                 return
     except PathStopped:
         return
+
+
+def _at_rest(path: Path, base: Point, high: Point) -> State:
+    """Where the holding force is zero between two points, by regula falsi until little of it is left."""
+    low, most = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
+    for _ in range(MOST_BRACKETS):
+        first, last = low.state.mu[FORCE], high.state.mu[FORCE]
+        s = low.s + (high.s - low.s) * first / (first - last)
+        middle = path.inside(s, low, high, base)
+        if isinstance(middle, str):
+            return path.between(s, low, high)
+        if abs(middle.state.mu[FORCE]) <= LITTLE * most:
+            return middle.state
+        low, high = (middle, high) if middle.state.mu[FORCE] * first > 0 else (low, middle)
+    return min(low, high, key=lambda end: abs(end.state.mu[FORCE])).state
 
 
 @dataclass
