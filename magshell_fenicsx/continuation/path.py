@@ -305,10 +305,15 @@ class Path:
         return max_abs(self.system.comm, guess.u - point.state.u)
 
     def _extended(self, s: float, passed: Sequence[Point]) -> State:
-        """A state at `s`, of the polynomial through points with their tangents; arc length is from the last."""
+        """A state at `s`, of the polynomial through points with their tangents; arc length is from the last.
+
+        Points before a turn of s do not count.
+        """
         last = passed[-1]
-        seen = [self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]]
-        return self._joined(s, [*seen, last])
+        seen = [*(self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]), last]
+        while len(seen) > 1 and min(steps := np.diff([point.s for point in seen])) * max(steps) <= 0:
+            seen.pop(0)
+        return self._joined(s, seen)
 
     def between(self, s: float, low: Point, high: Point) -> State:
         """A first guess at `s`: the Hermite cubic through two points."""

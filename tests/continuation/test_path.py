@@ -7,10 +7,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from continuation.toys import Toy, pitchfork, snap_through
+from scipy.interpolate import KroghInterpolator
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Control, Path, StepOptions
+from magshell_fenicsx.continuation.path import Control, Path, StepOptions, hermite
 from magshell_fenicsx.continuation.point import NoProgress, PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import instabilities
@@ -115,6 +116,23 @@ def test_targets_are_met_exactly() -> None:
     path, start = path_of(snap_through(), "conjugate", StepOptions(0.07, 0.3, 1e-6))
     reached = [point.s for point, flag in path.towards(start, [0.25, 0.5, 1.75]) if flag]
     assert reached == [0.25, 0.5, 1.75]
+
+
+def test_targets_may_turn_back() -> None:
+    """The next point is foreseen from three, of which no two are at one place."""
+    path, start = path_of(snap_through(), "conjugate", StepOptions(0.25, 0.25, 1e-6))
+    loads = [p.state.mu["load"] for p, flag in path.towards(start, [0.25, 0.5, 0.25, 0.0, 0.25]) if flag]
+    assert loads[0] == pytest.approx(loads[2], abs=1e-12)
+    assert loads[0] == pytest.approx(loads[4], abs=1e-12)
+
+
+def test_foreseen_as_by_scipy() -> None:
+    """The polynomial with given values and slopes at three places (Krogh 1970)."""
+    nodes, f, slope = [0.3, 1.0, 1.2], np.exp, np.exp
+    twice = np.repeat(nodes, 2)
+    given = KroghInterpolator(twice, [f(x) if i % 2 == 0 else slope(x) for i, x in enumerate(twice)])
+    ours = sum(a * f(x) + b * slope(x) for (a, b), x in zip(hermite(1.7, nodes), nodes, strict=True))
+    assert ours == pytest.approx(float(given(1.7)), rel=1e-13)
 
 
 def test_a_solver_is_released_with_its_factors() -> None:
