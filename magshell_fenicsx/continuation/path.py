@@ -283,15 +283,15 @@ class Path:
 
     def predict(self, s: float, passed: Sequence[Point]) -> State:
         """A first guess at `s`: linear, cubic, or quintic where that would have found the last point better."""
+        return self._extended(s, passed[-3:] if self._smooth(passed) else passed[-2:])
+
+    def _smooth(self, passed: Sequence[Point]) -> bool:
         *earlier, here = passed
-        if not earlier:
-            return self._extended(s, passed)
-        quintic = len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
-        return self._extended(s, passed[-3:] if quintic else passed[-2:])
+        return len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
 
     def _foreseen(self, passed: Sequence[Point], s: float) -> float:
         """The part of a step to `s` whose first guess is about as good as that of the last step, or good enough."""
-        if len(passed) <= 3:
+        if not self._smooth(passed):
             return 1.0
         *earlier, here = passed
         cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
