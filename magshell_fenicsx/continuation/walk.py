@@ -218,13 +218,13 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4): the order of the method is 1.44, and close to
-        zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4), the second time if the eigenvalue says that more is
+        left: the order of the method is 1.44, and close to zero the eigenvalue is only rounding.
         """
         path, side = self.path, 0
         first = critical_mode(stability, low.state)
         a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
-        agreed, last = self.tolerance**0.75, np.inf
+        agreed, last, settled = self.tolerance**0.75, np.inf, False
         slope = (b - a) / (high.state.mu[path.name] - low.state.mu[path.name])
         for _ in range(MOST_TRIALS):
             # the eigenvalue nearest to zero need not be the one that changes sign
@@ -237,7 +237,10 @@ class _Search:
             mu = point.state.mu[path.name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= agreed * abs(mu) and a * b < 0:
-                return replace(point, load_error=self.rest(point, stability, slope))
+                rest = self.rest(point, stability, slope)
+                if settled or rest <= self.tolerance * abs(mu):
+                    return replace(point, load_error=rest)
+                settled = True  # once more: a guess on the other side of the zero may be nearer
             if width <= self.tolerance * abs(mu):
                 return replace(point, load_error=max(width, self.rest(point, stability, slope)))
             last, mode = point.s, critical_mode(stability, point.state)
