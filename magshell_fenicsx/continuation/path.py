@@ -320,11 +320,12 @@ class Path:
         return self._joined(s, [low, high])
 
     def _joined(self, s: float, points: Sequence[Point]) -> State:
-        u, mu, last = np.zeros_like(points[0].du), 0.0, points[-1].state
+        last, name = points[-1].state, self.name
+        u, mu = np.array(last.u), last.mu[name]
         for (value, slope), point in zip(hermite(s, [point.s for point in points]), points, strict=True):
-            u += value * point.state.u + slope * point.du
-            mu += value * point.state.mu[self.name] + slope * point.dmu
-        return last.with_(u, self.name, float(mu))
+            u += value * (point.state.u - last.u) + slope * point.du  # what does not move stays, to the last digit
+            mu += value * (point.state.mu[name] - last.mu[name]) + slope * point.dmu
+        return last.with_(u, name, float(mu))
 
     def seen_from(self, base: Point, point: Point) -> Point:
         """The point with its tangent per unit of s, where s is measured from `base`."""
