@@ -218,8 +218,8 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4), the second time if the eigenvalue says that more is
-        left: the order of the method is 1.44, and close to zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4), or do so again if the eigenvalue says that more
+        is left: the order of the method is 1.44, and close to zero the eigenvalue is only rounding.
         """
         path, side = self.path, 0
         first = critical_mode(stability, low.state)
