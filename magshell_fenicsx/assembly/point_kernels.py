@@ -18,7 +18,11 @@ import numpy as np
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.algorithms.analysis import extract_type
+from ufl.algorithms.signature import compute_expression_signature
+from ufl.classes import Label
 from ufl.core.expr import Expr
+from ufl.domain import extract_domains
 
 from magshell_fenicsx.assembly import scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -98,9 +102,44 @@ def _kernel(
     size
         Number of the nodes that are made.
     """
-    graph = Scalars()
     fields, constants = inputs_of(expressions)
-    nodes = [flat(graph.components(e, fields, constants)) for e in expressions]
+    translated = cache(lambda: _graph(expressions, fields, constants))
+    structure = (asked, *_structures(expressions, fields, constants))
+    if structure not in _KEYS:
+        _KEYS[structure] = _key(asked, *translated())
+
+    def code() -> str:
+        graph, nodes = translated()
+        return point_code(graph, made(graph, nodes))
+
+    library = log.load(name, _KEYS[structure], code, OPTIONS, comm)
+    return PointKernel(function_of(library), fields, constants, size)
+
+
+_KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before in this process, by its structure
+
+
+def _structures(
+    expressions: Sequence[Expr], fields: Sequence[fem.Function], constants: Sequence[fem.Constant]
+) -> list[str]:
+    """What is the same for expressions that differ in nothing but which fields and constants they have."""
+    labels = {label for e in expressions for label in extract_type(e, Label)}
+    ordered = (fields, constants, sorted(labels, key=lambda label: label.count()))
+    numbers = {of: i for some in ordered for i, of in enumerate(some)}
+    numbers |= {domain: 0 for e in expressions for domain in extract_domains(e)}
+    return [compute_expression_signature(e, numbers) for e in expressions]
+
+
+def _graph(
+    expressions: Sequence[Expr], fields: Sequence[fem.Function], constants: Sequence[fem.Constant]
+) -> tuple[Scalars, list[list[int]]]:
+    """Operations, and the nodes of each expression."""
+    graph = Scalars()
+    return graph, [flat(graph.components(e, fields, constants)) for e in expressions]
+
+
+def _key(asked: str, graph: Scalars, nodes: list[list[int]]) -> str:
+    """What the code of a kernel depends on; neither the order nor the number of other operations."""
     number = {node: i for i, node in enumerate(graph.reached([node for each in nodes for node in each]))}
     operations = [
         (graph.operations[node][0], *(number[operand] for operand in operands)) if operands else graph.operations[node]
@@ -108,9 +147,7 @@ def _kernel(
         for operands in [graph.operands(node)]
     ]
     ends = [[number[node] for node in each] for each in nodes]
-    key = repr((_version(), asked, ends, operations))
-    library = log.load(name, key, lambda: point_code(graph, made(graph, nodes)), OPTIONS, comm)
-    return PointKernel(function_of(library), fields, constants, size)
+    return hashlib.sha256(repr((_version(), asked, ends, operations)).encode()).hexdigest()
 
 
 @cache
