@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
-from ufl.algorithms.analysis import extract_type
 from ufl.algorithms.signature import compute_expression_signature
 from ufl.classes import Label
 from ufl.core.expr import Expr
@@ -26,7 +26,7 @@ from ufl.domain import extract_domains
 
 from magshell_fenicsx.assembly import scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.scalars import Scalars, flat, inputs_of
+from magshell_fenicsx.assembly.scalars import Scalars, flat, terminals_of
 
 Pair = tuple[int, int]
 Array = NDArray[np.float64]
@@ -102,9 +102,9 @@ def _kernel(
     size
         Number of the nodes that are made.
     """
-    fields, constants = inputs_of(expressions)
+    fields, constants, labels = terminals_of(expressions, ufl.Coefficient, ufl.Constant, Label)
     translated = cache(lambda: _graph(expressions, fields, constants))
-    structure = (asked, *_structures(expressions, fields, constants))
+    structure = (asked, *_structures(expressions, fields, constants, labels))
     if structure not in _KEYS:
         _KEYS[structure] = _key(asked, *translated())
 
@@ -119,13 +119,9 @@ def _kernel(
 _KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before in this process, by its structure
 
 
-def _structures(
-    expressions: Sequence[Expr], fields: Sequence[fem.Function], constants: Sequence[fem.Constant]
-) -> list[str]:
-    """What is the same for expressions that differ in nothing but which fields and constants they have."""
-    labels = {label for e in expressions for label in extract_type(e, Label)}
-    ordered = (fields, constants, sorted(labels, key=lambda label: label.count()))
-    numbers = {of: i for some in ordered for i, of in enumerate(some)}
+def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str]:
+    """What is the same for expressions that differ in nothing but which inputs they have."""
+    numbers = {of: i for some in inputs for i, of in enumerate(some)}
     numbers |= {domain: 0 for e in expressions for domain in extract_domains(e)}
     return [compute_expression_signature(e, numbers) for e in expressions]
 

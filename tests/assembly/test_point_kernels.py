@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_gradient, point_hessian, point_values
-from magshell_fenicsx.assembly.scalars import Scalars, inputs_of
+from magshell_fenicsx.assembly.scalars import Scalars, terminals_of
 
 Array = np.ndarray
 i, j, k = ufl.indices(3)
@@ -193,4 +193,4 @@ def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) 
 def test_what_no_point_has_is_refused() -> None:
     x = ufl.SpatialCoordinate(Points(1)._mesh)
     with pytest.raises(NotImplementedError, match="SpatialCoordinate"):
-        Scalars().components(x[0], *inputs_of([x[0]]))
+        Scalars().components(x[0], *terminals_of([x[0]], ufl.Coefficient, ufl.Constant))
