@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,29 @@ mesh: {degree: 3, refinement: 0.5}
 loading: {kind: field, points: 4}
 """  # in units, bent by a field
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
+
+
+@pytest.hookimpl(trylast=True)  # after tests that are not asked for have been left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Each of several workers begins with files that have slow tests: what it takes from others at the end is short.
+
+    pytest-xdist gives each an equal part of the list, one after the other; an idle one takes the last half of what
+    another has left.
+    """
+    if (workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) == 1:
+        return
+    files = [list(tests) for _, tests in groupby(items, lambda item: item.path)]
+    slow = [tests for tests in files if any(item.get_closest_marker("slow") for item in tests)]
+    quick = [item for tests in files if tests not in slow for item in tests]
+    parts = [[item for tests in slow[worker::workers] for item in tests] for worker in range(workers)]
+    left = len(items)
+    for worker, part in enumerate(parts):
+        size = left // (workers - worker)
+        left -= size
+        missing = max(size - len(part), 0)
+        part += quick[:missing]
+        del quick[:missing]
+    items[:] = [item for part in parts for item in part] + quick
 
 
 @pytest.fixture(autouse=True)

@@ -12,17 +12,21 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.algorithms.signature import compute_expression_signature
+from ufl.classes import Label
 from ufl.core.expr import Expr
+from ufl.domain import extract_domains
 
 from magshell_fenicsx.assembly import scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.scalars import Scalars, flat, inputs_of
+from magshell_fenicsx.assembly.scalars import Scalars, flat, terminals_of
 
 Pair = tuple[int, int]
 Array = NDArray[np.float64]
@@ -98,9 +102,40 @@ def _kernel(
     size
         Number of the nodes that are made.
     """
+    fields, constants, labels = terminals_of(expressions, ufl.Coefficient, ufl.Constant, Label)
+    translated = cache(lambda: _graph(expressions, fields, constants))
+    structure = (asked, *_structures(expressions, fields, constants, labels))
+    if structure not in _KEYS:
+        _KEYS[structure] = _key(asked, *translated())
+
+    def code() -> str:
+        graph, nodes = translated()
+        return point_code(graph, made(graph, nodes))
+
+    library = log.load(name, _KEYS[structure], code, OPTIONS, comm)
+    return PointKernel(function_of(library), fields, constants, size)
+
+
+_KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before in this process, by its structure
+
+
+def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str]:
+    """What is the same for expressions that differ in nothing but which inputs they have."""
+    numbers = {of: i for some in inputs for i, of in enumerate(some)}
+    numbers |= {domain: 0 for e in expressions for domain in extract_domains(e)}
+    return [compute_expression_signature(e, numbers) for e in expressions]
+
+
+def _graph(
+    expressions: Sequence[Expr], fields: Sequence[fem.Function], constants: Sequence[fem.Constant]
+) -> tuple[Scalars, list[list[int]]]:
+    """Operations, and the nodes of each expression."""
     graph = Scalars()
-    fields, constants = inputs_of(expressions)
-    nodes = [flat(graph.components(e, fields, constants)) for e in expressions]
+    return graph, [flat(graph.components(e, fields, constants)) for e in expressions]
+
+
+def _key(asked: str, graph: Scalars, nodes: list[list[int]]) -> str:
+    """What the code of a kernel depends on; neither the order nor the number of other operations."""
     number = {node: i for i, node in enumerate(graph.reached([node for each in nodes for node in each]))}
     operations = [
         (graph.operations[node][0], *(number[operand] for operand in operands)) if operands else graph.operations[node]
@@ -108,9 +143,7 @@ def _kernel(
         for operands in [graph.operands(node)]
     ]
     ends = [[number[node] for node in each] for each in nodes]
-    key = repr((_version(), asked, ends, operations))
-    library = log.load(name, key, lambda: point_code(graph, made(graph, nodes)), OPTIONS, comm)
-    return PointKernel(function_of(library), fields, constants, size)
+    return hashlib.sha256(repr((_version(), asked, ends, operations)).encode()).hexdigest()
 
 
 @cache

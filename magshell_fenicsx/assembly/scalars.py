@@ -9,14 +9,13 @@ from math import prod
 from typing import Any
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 from ufl import classes
-from ufl.algorithms.analysis import extract_type, has_type
+from ufl.algorithms.analysis import has_type
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.core.expr import Expr
-from ufl.corealg.traversal import unique_post_traversal
+from ufl.corealg.traversal import traverse_unique_terminals, unique_post_traversal
 
 Nodes = NDArray[np.int64]
 First = dict[int, int]  # operand or input -> derivative
@@ -403,13 +402,10 @@ def flat(nodes: Nodes) -> list[int]:
     return [int(node) for node in nodes.ravel()]
 
 
-def inputs_of(expressions: Iterable[Expr]) -> tuple[list[Any], list[Any]]:
-    """The fields and the constants of some expressions, each in the order in which they were made."""
-    fields, constants = set[Any](), set[Any]()
-    for e in expressions:
-        fields |= extract_type(e, ufl.Coefficient)
-        constants |= extract_type(e, ufl.Constant)
-    return sorted(fields, key=lambda f: f.count()), sorted(constants, key=lambda c: c.count())
+def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], ...]:
+    """Those of each kind that occur, in the order in which they were made."""
+    terminals = {terminal for e in expressions for terminal in traverse_unique_terminals(e)}
+    return tuple(sorted((t for t in terminals if isinstance(t, kind)), key=lambda t: t.count()) for kind in kinds)
 
 
 def _indexed(value: Nodes, e: Expr) -> Nodes:

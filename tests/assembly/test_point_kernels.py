@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_gradient, point_hessian, point_values
-from magshell_fenicsx.assembly.scalars import Scalars, inputs_of
+from magshell_fenicsx.assembly.scalars import Scalars, terminals_of
 
 Array = np.ndarray
 i, j, k = ufl.indices(3)
@@ -157,7 +157,40 @@ def test_each_operation_occurs_once() -> None:
     assert s.power(x, s.number(0.5)) == s.node("sqrt", x)
 
 
+def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of other fields and constants; another number, order of arguments or result is another kernel."""
+    translated = list[Expr]()
+    components = Scalars.components
+
+    def counted(self: Scalars, e: Expr, *others: Any) -> Any:
+        translated.append(e)
+        return components(self, e, *others)
+
+    monkeypatch.setattr(Scalars, "components", counted)
+
+    def value(W: Callable[..., Expr], *given: float) -> float:
+        points = Points(1)
+        a, b, c = points.field(2), points.field(2), fem.Constant(points._mesh, float(given[4]))
+        a.x.array[:], b.x.array[:] = given[:2], given[2:4]
+        kernel = point_values("once", W(a, b, ufl.variable(c)), KernelLog(), MPI.COMM_SELF)
+        return float(points.evaluate(kernel, 1)[0, 0])
+
+    def first(a: Expr, b: Expr, c: Expr) -> Expr:
+        return ufl.as_vector([c * a[0] * b[1] + 0.125 * a[1]])
+
+    assert value(first, 2, 3, 4, 5, 7) == pytest.approx(7 * 2 * 5 + 0.375)
+    assert len(translated) == 1
+    assert value(first, 1, 4, 6, 2, 3) == pytest.approx(3 * 1 * 2 + 0.5)
+    assert len(translated) == 1
+    assert value(lambda a, b, c: first(b, a, c), 2, 3, 4, 5, 7) == pytest.approx(7 * 4 * 3 + 0.625)
+    assert value(lambda a, b, c: first(a, b, c) + ufl.as_vector([1e-9]), 2, 3, 4, 5, 7) > 70.375
+    assert value(lambda a, b, c: first(a, b, c) + ufl.as_vector([2e-9]), 2, 3, 4, 5, 7) == pytest.approx(
+        70.375 + 2e-9, rel=1e-13
+    )
+    assert len(translated) == 4
+
+
 def test_what_no_point_has_is_refused() -> None:
     x = ufl.SpatialCoordinate(Points(1)._mesh)
     with pytest.raises(NotImplementedError, match="SpatialCoordinate"):
-        Scalars().components(x[0], *inputs_of([x[0]]))
+        Scalars().components(x[0], *terminals_of([x[0]], ufl.Coefficient, ufl.Constant))

@@ -1,6 +1,7 @@
 """The schema of the case file, and the page that is made of it: current, complete, and of one mind with `Case`."""
 
 import json
+from functools import cache
 from typing import Any
 
 import pytest
@@ -36,11 +37,16 @@ def test_every_key_is_described() -> None:
     assert [name for name, section in sections.items() if "description" not in section] == []
 
 
+@pytest.fixture(scope="module")
+def committed() -> Draft202012Validator:
+    content = json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8"))
+    Draft202012Validator.check_schema(content)
+    return Draft202012Validator(content)
+
+
 @pytest.mark.parametrize("file", sorted(CASES.rglob("*.yaml")), ids=lambda file: file.stem)
-def test_every_case_fits(file: Any) -> None:
-    committed = json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8"))
-    Draft202012Validator.check_schema(committed)
-    Draft202012Validator(committed).validate(read_source(file).data)
+def test_every_case_fits(committed: Draft202012Validator, file: Any) -> None:
+    committed.validate(read_source(file).data)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +101,12 @@ def test_mistakes_that_do_not_fit(setting: str) -> None:
         Case.load(CASES / "dimple_buckling.yaml", [setting])
 
 
+@cache
+def current() -> Draft202012Validator:
+    return Draft202012Validator(schema())
+
+
 def fits(setting: str) -> bool:
     source = read_source(CASES / "dimple_buckling.yaml")
     override(source, setting)
-    return bool(Draft202012Validator(schema()).is_valid(source.data))
+    return bool(current().is_valid(source.data))

@@ -58,7 +58,7 @@ DIMPLED = [
     ("R_over_h", "lambda_m", "energy", "k_d", "symmetry", "tolerance"),
     [
         *((*each, "auto", 1e-6) for each in DIMPLED),
-        *(pytest.param(*DIMPLED[i], "half", 2e-4, marks=pytest.mark.slow) for i in (1, 2, 5)),
+        *(pytest.param(*DIMPLED[i], "half", 2e-4, marks=pytest.mark.slow) for i in (2, 5)),
     ],
 )
 def test_dimple_buckling(
@@ -143,11 +143,9 @@ def test_dimple_drift_on_the_shell() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("remanent", "applied", "refinement"), [(45, 45, 0.45), (0, 45, 0.45)])
-def test_half_and_full_shell_agree(remanent: float, applied: float, refinement: float) -> None:
-    """Tilted coplanar fields."""
-    field = f"magnetic={{lambda_m: 0.00184, remanent: {{polar: {remanent}}}, applied: {{polar: {applied}}}}}"
-    settings = field, f"mesh.refinement={refinement}"
+def test_half_and_full_shell_agree() -> None:
+    """A field that is tilted to the remanence, in its plane."""
+    settings = "magnetic={lambda_m: 0.00184, remanent: {polar: 0}, applied: {polar: 45}}", "mesh.refinement=0.45"
     half, full = (result("dimple_buckling.yaml", *settings, f"symmetry={s}") for s in ("half", "none"))
     assert half.knockdown == pytest.approx(full.knockdown, rel=1e-4)
 
@@ -327,16 +325,12 @@ def test_solid_indentation() -> None:
         assert force_at(solid, depth) == pytest.approx(force_at(shell, depth), rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("polar", "shortening", "deflection"),
-    [(0.0, 0.32894, 0.66996), pytest.param(-60.0, 0.67087, 0.80901, marks=pytest.mark.slow)],
-)
-def test_magnetic_strip_as_a_solid(polar: float, shortening: float, deflection: float) -> None:
+def test_magnetic_strip_as_a_solid() -> None:
     """The same elastica as of `test_magnetic_strip`; nu = 0, so that the strip bends like a rod."""
-    found = result("magnetic_strip.yaml", f"magnetic.applied.polar={polar}", "model=solid")
+    found = result("magnetic_strip.yaml", "magnetic.applied.polar=0.0", "model=solid")
     moved = found.scene.model.displacement(found.last.u, "pole")
-    assert -moved[0] == pytest.approx(shortening, rel=1e-3)
-    assert moved[2] == pytest.approx(deflection, rel=1e-3)
+    assert -moved[0] == pytest.approx(0.32894, rel=1e-3)
+    assert moved[2] == pytest.approx(0.66996, rel=1e-3)
 
 
 @pytest.mark.slow

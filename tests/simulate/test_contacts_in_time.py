@@ -106,12 +106,15 @@ def test_a_driven_ball_does_the_work() -> None:
     assert abs(found[-1]["imbalance"]) < 1e-5 * abs(found[-1]["work"])
 
 
+SHOWN_ABOVE = ("the same, fixed step", "viscous cap on a ball")  # an impact that conserves energy, a cap that stays
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_ten_contacts_are_in_balance_and_two_runs_stay_together(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name in CASES if name not in SHOWN_ABOVE])
+def test_contacts_are_in_balance_and_two_runs_stay_together(name: str) -> None:
     """Impact, release, rest, a held gas: within the default `balance`, and beside a Poisson's ratio that is changed.
 
-    For a quarter of the time of docs/accuracy.md.
+    For a quarter of the time of docs/accuracy.md, which has two more.
     """
     base, bodies, (*before, motion) = CASES[name]
     steps = [*before, motion | {"duration": motion["duration"] / 4, "points": motion["points"] // 4}]

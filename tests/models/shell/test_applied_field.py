@@ -36,7 +36,7 @@ def linear() -> FormulasInSpace:
 
 
 def shell(field: Magnetisation) -> ShellModel:
-    return ShellModel(hemisphere(0.8), MATERIAL, 3, {}, Loads(magnetic=field))
+    return ShellModel(hemisphere(0.8), MATERIAL, 2, {}, Loads(magnetic=field))
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ TERMS = [
     "Utau",
     "couple",
 ]
-DEGREES, HIGH = [2, 3], [2, pytest.param(5, marks=pytest.mark.slow)]
+DEGREES = [2, pytest.param(5, marks=pytest.mark.slow)]
 
 
 def alone(model: ShellModel, name: str) -> FiniteElementSystem:
@@ -44,15 +44,14 @@ def alone(model: ShellModel, name: str) -> FiniteElementSystem:
     return FiniteElementSystem(model.u, [term], [], pattern, 1.0, tangent)
 
 
-@pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("name", TERMS)
-def test_term_alone(shell: Shells, degree: int, name: str) -> None:
-    model = shell(degree, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent")
-    u = random_displacement(model, 2e-3 / degree**2)
+def test_term_alone(shell: Shells, name: str) -> None:
+    model = shell(2, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent")
+    u = random_displacement(model, 5e-4)
     check(alone(model, name), u, {"lambda_m": 1.0, "pressure": 1.0})
 
 
-@pytest.mark.parametrize("degree", HIGH)
+@pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("half", [False, True])
 def test_terms_together(shell: Shells, degree: int, half: bool) -> None:
     model = shell(degree, half=half)
@@ -65,7 +64,7 @@ def test_field_gradient_and_pattern() -> None:
     """Br varying over the surface in a field linear in space."""
     G = np.array([[-0.5, 0.2, 0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
     field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G)
-    model = ShellModel(hemisphere(), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
+    model = ShellModel(hemisphere(), Material(0.3, 0.05), 2, {}, Loads(magnetic=field))
     u = random_displacement(model, 2e-4)
     for name in ("magnetic", "magnetic gradient"):
         check(alone(model, name), u, {"lambda_m": 1.0})
@@ -74,7 +73,7 @@ def test_field_gradient_and_pattern() -> None:
 @pytest.mark.parametrize("amplitude", ["lambda_m", "pressure"])
 def test_tangent_changes_with_each_amplitude(shell: Shells, amplitude: str) -> None:
     """K(mu) - K(0) = mu K_mu, and K_mu is not zero."""
-    model = shell(3)
+    model = shell(2)
     u = random_displacement(model, 1e-3)
     zero = {"lambda_m": 0.0, "pressure": 0.0}
     K = [csr(model.system.tangent(u, {**zero, amplitude: mu})) for mu in (0.0, 0.5, 1.0)]
@@ -87,7 +86,7 @@ def test_force_has_the_load_vector_of_its_work() -> None:
     """Pi_F = -F w, and its column is minus the gradient of w."""
     surface = hemisphere()
     for force in (Force("load"), Force("load", patch=0.7)):
-        model = ShellModel(surface, Material(0.3, 0.05), 3, {}, Loads(forces={"force": force}))
+        model = ShellModel(surface, Material(0.3, 0.05), 2, {}, Loads(forces={"force": force}))
         u = random_displacement(model, 1e-3)
         load = model.system.load(u, {}, "force")
         assert -load @ u == pytest.approx(model.force_unit * model.loaded_deflection(u, "force"), rel=1e-12)

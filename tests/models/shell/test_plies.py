@@ -72,7 +72,7 @@ def shell(of: Laminate | None, *, half: bool = False, natural: bool = False, var
     edges: dict[str, Condition] = {"rim": "clamped"}
     if half:
         edges["symmetry"] = "symmetry"
-    return ShellModel(surface, Material(0.3, 0.05, laminate=of), 3, edges, loads, thickness=thickness)
+    return ShellModel(surface, Material(0.3, 0.05, laminate=of), 2, edges, loads, thickness=thickness)
 
 
 def meridian(of: Laminate | None) -> MeridianModel:

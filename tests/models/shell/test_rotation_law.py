@@ -102,7 +102,7 @@ FIELD = replace(TILTED, gradient=G, across=(np.array([1.0, 0.0, 0.0]),), law="ro
 def test_derivatives(kind: MagneticEnergy) -> None:
     """Of each term, at a pattern: points against forms, and these against finite differences."""
     field = replace(FIELD, remanent=tangential, energy=kind, gradient=G if kind == "full" else None)
-    model = ShellModel(hemisphere(0.8), MATERIAL, 3, {}, Loads(pressure=True, magnetic=field))
+    model = ShellModel(hemisphere(0.8), MATERIAL, 2, {}, Loads(pressure=True, magnetic=field))
     u = random_displacement(model, 1e-3)
     for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0, "pressure": 0.0}, {**MU, "lambda_m": 10.0}):
         assert tangent_difference(model.system, u, mu) <= 1e-12

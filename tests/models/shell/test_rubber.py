@@ -94,7 +94,7 @@ def shell(share: float, *, half: bool = False, natural: bool = False, varies: bo
     edges: dict[str, Condition] = {"rim": "clamped"}
     if half:
         edges["symmetry"] = "symmetry"
-    return ShellModel(surface, Material(0.5, 0.05, share), 3, edges, loads, thickness=thickness)
+    return ShellModel(surface, Material(0.5, 0.05, share), 2, edges, loads, thickness=thickness)
 
 
 @pytest.mark.slow
