@@ -102,7 +102,7 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     c = [0.0, a**2]
     for k in range(1, TERMS):
         c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
-    series = [_horner(np.polynomial.polynomial.polyder(c, n).tolist(), w) for n in range(3)]
+    series = [_horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w) for n in range(3)]
     if a == int(a) and abs(a) <= TERMS:  # a polynomial
         return series[0], series[1], series[2]
     small = ufl.lt(w, SMALL) if isinstance(w, Expr) else np.real(w) < SMALL

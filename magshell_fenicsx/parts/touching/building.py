@@ -92,8 +92,8 @@ def touchings(
     powers, grown = np.array([times]), None
     if natural and natural.stretch is not None:
         of_nodes = element.tabulate(1, element.points)[1:, ..., 0]
-        first = np.einsum("dqk,nki->dnqi", of_nodes, r0.x.array.reshape(-1, 3)[V.dofmap.list])
-        rates = natural.volumes(first, element.points)
+        tangents = np.einsum("dqk,nki->dnqi", of_nodes, r0.x.array.reshape(-1, 3)[V.dofmap.list])
+        rates = natural.volumes(tangents, element.points)
         rates[:, ~thinning] = np.eye(4)[0][:, None, None]
         powers, grown = times * rates[:, :count], natural.stretch
     powers, keeps_volume = np.array([cells_of_all.gathered(each) for each in powers]), cells_of_all.gathered(thinning)
