@@ -11,7 +11,7 @@ from functools import cache, reduce
 from math import isnan, nan
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -363,6 +363,9 @@ def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
     return {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
 
+Rubberlike: TypeAlias = float | tuple[tuple[float, ...], tuple[float, ...]]  # see `parts.rubber.LawKeys.rubber`
+
+
 class Sized(Protocol):
     """A shell with or without units."""
 
@@ -374,7 +377,7 @@ class Sized(Protocol):
     def R_over_h(self) -> float: ...
 
     @property
-    def rubber(self) -> float | None: ...
+    def rubber(self) -> Rubberlike | None: ...
     @property
     def poisson_ratio(self) -> float: ...
     @property

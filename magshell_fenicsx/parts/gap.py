@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows
+from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.models.carriers import Carrier
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
@@ -27,12 +28,21 @@ class Grown(Protocol):
     """A natural shape."""
 
     @property
+    def stretch(self) -> Settable | None:
+        """The amplitude of its stretch; None if that does not grow."""
+        ...
+
+    @property
     def values(self) -> tuple[Array, ...] | None:
         """On which its volume depends; None if that is the undeformed one."""
         ...
 
     def volume(self, first: Array, points: Array) -> Array:
         """Over the undeformed one (cells, places), where the surface has these tangents (2, cells, places, 3)."""
+        ...
+
+    def volumes(self, first: Array, points: Array) -> Array:
+        """Its coefficients (4, cells, places) by powers of the amplitude."""
         ...
 
 

@@ -1,21 +1,29 @@
-"""The law of a shell's material: small strains, or rubber of two kinds, with what each is not for, and its words."""
+"""The law of a shell's material: small strains, or rubber of three kinds, with what each is not for, and its words."""
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from math import isfinite
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.section import Rubberlike, Section
 from magshell_fenicsx.parts.part import Ability, Context, Offer
+
+Exponent = Annotated[float, Field(ge=-20, le=20)]
 
 
 class LawKeys(Section):
     """The keys of a shell that choose its law."""
 
-    law: Literal["koiter", "neo-hookean", "mooney-rivlin"] = "koiter"
+    law: Literal["koiter", "neo-hookean", "mooney-rivlin", "ogden"] = "koiter"
     """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6 (C10 + C01)"""
     mooney: float | None = Field(default=None, ge=0, le=1000)
     """C01/C10 of law: mooney-rivlin"""
+    mu: list[float] | None = Field(default=None, min_length=1, max_length=6)
+    """Of law: ogden, of each term of its energy mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3); only their ratios count,
+    for E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
+    alpha: list[Exponent] | None = Field(default=None, min_length=1, max_length=6)
+    """Of law: ogden, the exponent of each term, with the sign of its mu"""
 
     @model_validator(mode="after")
     def _law_fits(self) -> Self:
@@ -23,13 +31,25 @@ class LawKeys(Section):
             raise ValueError(
                 f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}"
             )
+        ogden, mu, alpha = self.law == "ogden", self.mu or [], self.alpha or []
+        if bool(mu) != ogden or len(mu) != len(alpha):
+            raise ValueError(
+                f"mu, alpha: lists, one as long as the other, of law: ogden alone; here the law is {self.law}, with "
+                f"{len(mu)} and {len(alpha)} numbers"
+            )
+        for i, (one, exponent) in enumerate(zip(mu, alpha, strict=True)):
+            if not (isfinite(one) and one * exponent > 0):
+                raise ValueError(f"mu.{i}: {one:g}: mu alpha must be positive; here alpha is {exponent:g}")
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
         return self
 
     @property
-    def rubber(self) -> float | None:
-        """C01/(C10 + C01); None of Koiter's law."""
+    def rubber(self) -> Rubberlike | None:
+        """C01/(C10 + C01); of Ogden's law all mu over E, and all alpha; None of Koiter's law."""
+        if self.mu and self.alpha:
+            whole = 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
+            return tuple(mu / whole for mu in self.mu), tuple(self.alpha)
         ratio = self.mooney or 0.0
         return None if self.law == "koiter" else ratio / (1 + ratio)
 
@@ -46,6 +66,11 @@ class Rubber(Ability):
         laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
         return next((cls(law) for law in laws), None)
 
+    def refuse_unfit(self, context: Context) -> None:
+        """See that Ogden's law is that of a shell."""
+        if self.law == "ogden":
+            context.needs("law: ogden", "a mid-surface")
+
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Rubber keeps its volume."""
         return {"a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"}
@@ -57,9 +82,13 @@ def laws_of(context: Context) -> list[str]:
     return [*several.laws.values()] if several else [context.shell.law]
 
 
-def law_account(rubber: float | None) -> str:
+def law_account(rubber: Rubberlike | None) -> str:
     """The words of `magshell check`; see `LawKeys.rubber`."""
     if rubber is None:
         return "membrane and bending energy"
-    law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"
+    if isinstance(rubber, tuple):
+        terms = ", ".join(f"{mu:.5g} and {alpha:g}" for mu, alpha in zip(*rubber, strict=True))
+        law = f"Ogden, mu/E and alpha: {terms}"
+    else:
+        law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"
     return f"membrane and bending energy of incompressible rubber at any stretch ({law}); its thickness follows"

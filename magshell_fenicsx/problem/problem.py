@@ -52,7 +52,9 @@ def body_of(context: Context) -> Body | None:
     if not context.solid:
         return None
     shell, ratio = context.shell, _section(context).bulk_to_shear
-    return Body(MooneyRivlin.of(shell.poisson_ratio, ratio, shell.rubber or 0.0), layers(context))
+    share = shell.rubber or 0.0
+    assert isinstance(share, float)  # Ogden's law needs a mid-surface
+    return Body(MooneyRivlin.of(shell.poisson_ratio, ratio, share), layers(context))
 
 
 def layers(context: Context) -> list[float]:

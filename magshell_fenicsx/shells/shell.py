@@ -253,7 +253,7 @@ class ShellModel(Thin):
         of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
         thick = factor, factory.law_of_cells.thins
         surfaces = self.r0, self.u, midsurface.patches
-        self.touchings = touchings(loads.pairs, *surfaces, material.h, rule, *thick, *of_images)
+        self.touchings = touchings(loads.pairs, *surfaces, material.h, rule, *thick, *of_images, shape)
         terms += self.touchings
         terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
@@ -286,6 +286,8 @@ class ShellModel(Thin):
             **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
+        for each in self.touchings:
+            parameters |= each.entered(parameters)
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)

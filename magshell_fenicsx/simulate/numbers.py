@@ -20,9 +20,11 @@ from magshell_fenicsx.problem.wanted import FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
 OF_MATERIAL = (
+    "alpha",
     "density",
     "laminate",
     "mooney",
+    "mu",
     "poisson_ratio",
     "radius_to_thickness",
     "thickness",

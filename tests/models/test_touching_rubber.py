@@ -19,7 +19,9 @@ h, FOUNDATION = 0.02, 1e-3  # over R; over E/R
 TENSION, PRESSURE = 0.2, 2.0  # over E h, and over E h/R
 
 
-def sheets(*, laws: tuple[str, str] = ("neo-hookean", "neo-hookean"), thick: float = 1.0) -> Scene:
+def sheets(
+    *, laws: tuple[str, str] = ("neo-hookean", "neo-hookean"), thick: float = 1.0, grown: float | None = None
+) -> Scene:
     """Two unit squares whose faces meet, pulled in both directions and pressed together; the upper one h `thick`."""
 
     def sheet(law: str, thickness: float, z: float) -> dict[str, Any]:
@@ -41,8 +43,11 @@ def sheets(*, laws: tuple[str, str] = ("neo-hookean", "neo-hookean"), thick: flo
         "contact": [["upper", "lower"]],
         "foundation": {"stiffness": FOUNDATION},
         "mesh": {"degree": 2, "size": 0.7},
-        "loading": {"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": [*pulls, *pushes]},
+        "loading": [{"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": [*pulls, *pushes]}],
     }
+    if grown:
+        case |= {"natural": {"stretch": grown}}
+        case["loading"] = [{"kind": "natural", "stretch": 1}, *case["loading"]]
     return Scene(Case.model_validate(case))
 
 
@@ -55,20 +60,22 @@ def test_gap_of_stretched_sheets() -> None:
     assert gap == pytest.approx(1.1 * 1.25 * h - h / 2 - 0.75 * h / (1.3 * 1.2), abs=1e-14)
 
 
-def test_pressed_sheets() -> None:
+@pytest.mark.parametrize("grown", [None, 1.1])
+def test_pressed_sheets(grown: float | None) -> None:
     """Newton's method is quadratic; mid-surfaces are h/l^2 apart, and pressing stretches: h 1e-6.
 
-    With the pressure q per undeformed area, the tension T and the penetration s, of each sheet
+    With the pressure q per undeformed area, the tension T and the penetration s, of each sheet that has grown to g
 
-        (E h/3)(l - l^-5) = T + q h/(2 l^3),   d = h/l^2 - s,   q = k (s - SOFT h/2).
+        (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT h/2).
     """
-    scene = sheets()
+    scene, g = sheets(grown=grown), grown or 1.0
     model, (term,) = scene.model, scene.model.touchings
     system, r0 = model.system, model.r0.x.array.reshape(-1, 3)
     upper = r0[:, 2] > h / 2
-    guess = r0 * [0.14, 0.15, 0.0]
-    guess[upper, 2] = -0.25 * h
-    u, mu, steps = system.held(guess.ravel()), scene.unloaded().mu | {"load": 1.0}, list[float]()
+    guess = r0 * (g * np.array([1.14, 1.15, 1.0]) - [1, 1, g])
+    guess[upper, 2] = (0.75 * g - 1) * h
+    mu = scene.unloaded().mu | {"load": 1.0} | ({"natural_stretch": 1.0} if grown else {})
+    u, steps = system.held(guess.ravel()), list[float]()
     for _ in range(12):
         step = spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
         u, steps = u - step, [*steps, float(np.abs(step).max())]
@@ -78,16 +85,16 @@ def test_pressed_sheets() -> None:
     assert all(b < 1e3 * a**2 for a, b in below), steps
     r = r0 + u.reshape(-1, 3)
     assert np.ptp(r[upper, 2]) < 1e-9 * h
-    stretch, d = r[upper, 0].max(), r[upper, 2].mean() - r[~upper, 2].mean()
-    assert stretch > 1.14
+    stretch, d = r[upper, 0].max() / g, r[upper, 2].mean() - r[~upper, 2].mean()
+    assert stretch > 1.1
     q = system.at(State(u, mu)).of(term.force)  # over E h/R, of an area of one
     assert q == pytest.approx(PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h, rel=1e-9)
-    assert (stretch - stretch**-5) / 3 == pytest.approx(TENSION + q * h / (2 * stretch**3), rel=1e-6)
+    assert g**2 * (stretch - stretch**-5) / 3 == pytest.approx(TENSION + q * h / (2 * stretch**3), rel=1e-6)
     s = q / term.stiffness.value + SOFT * h / 2
-    assert d == pytest.approx(h / stretch**2 - s, abs=1e-6 * h)
+    assert d == pytest.approx(g * h / stretch**2 - s, abs=1e-6 * h)
 
 
-def ring() -> Scene:
+def ring(**more: Any) -> Scene:
     """A tube between mirrors that can be pressed flat."""
     shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
     held = {"east": {"held": ["y"]}, "west": {"held": ["y"]}, "north": {"held": ["x"]}}
@@ -101,19 +108,25 @@ def ring() -> Scene:
                 "mesh": {"size": 0.2, "degree": 3},
                 "loading": {"kind": "pressure"},
             }
+            | more
         )
     )
 
 
-def test_derivatives() -> None:
-    """Of a tube that is pressed flat and stretched, at rough states: differences of energy and forces, 1e-6."""
-    scene = ring()
-    system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
+def flattened(scene: Scene) -> Array:
+    """The displacement (nodes, 3) of a tube that is pressed flat and stretched."""
     r = scene.model.r0.x.array.reshape(-1, 3)
     flat = 0 * r
     flat[:, 0] = 0.3 * r[:, 0]
     width = 0.4 * h * (1 + 0.02 * r[:, 0]) + 2.5 * np.maximum(np.abs(r[:, 0]) - 0.5, 0) ** 2
     flat[:, 1] = np.tanh(r[:, 1] / 0.2) * width - r[:, 1]
+    return flat
+
+
+def test_derivatives() -> None:
+    """Of a tube that is pressed flat and stretched, at rough states: differences of energy and forces, 1e-6."""
+    scene = ring()
+    system, (term,), mu, flat = scene.model.system, scene.model.touchings, scene.unloaded().mu, flattened(scene)
     for seed in range(2):
         rough, moved, other = (
             system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
@@ -128,6 +141,33 @@ def test_derivatives() -> None:
         energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
         assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
         assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)
+
+
+def test_derivatives_by_the_natural_stretch() -> None:
+    """The slope of the energy, of the forces and of the slope itself: differences of fourth order, 1e-6."""
+    load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]
+    scene = ring(natural={"stretch": ["1.2 + 0.1*x", 0.9], "along": [0, 0, 1]}, loading=load)
+    system, (term,), flat = scene.model.system, scene.model.touchings, flattened(scene).ravel()
+    u = system.held(flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size))
+    slope, step = system.parameters["natural_stretch"].slopes[-1], 1e-6
+    (twice,) = system.parameters["natural_stretch"].bends(system.parameters["natural_stretch"].constant)[-1:]
+
+    def mu(n: int) -> dict[str, float]:
+        return scene.unloaded().mu | {"natural_stretch": 0.6 + n * step}
+
+    def differed(of: Any) -> Any:
+        return (8 * (of(1) - of(-1)) - (of(2) - of(-2))) / (12 * step)
+
+    at = system.at(State(u, mu(0)))
+    assert at.of(term.penetration) > 0.05 * h
+    force = np.zeros_like(u)
+    at.of(lambda: slope.add_residual(force, 1.0))
+    assert at.of(slope.energy) == pytest.approx(differed(lambda n: system.energies(u, mu(n))[term.name]), rel=1e-6)
+    forces = differed(lambda n: system.forces(u, mu(n), term.name))
+    assert np.abs(force - forces).max() < 1e-6 * np.abs(forces).max()
+    assert at.of(twice.energy) == pytest.approx(
+        differed(lambda n: system.at(State(u, mu(n))).of(slope.energy)), rel=1e-6
+    )
 
 
 def test_thin_walls_that_pass_through() -> None:

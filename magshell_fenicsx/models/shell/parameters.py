@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.input.section import Rubberlike
 from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, OfShells
+from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.models.shell.rubber import Rubber
@@ -48,7 +50,7 @@ class OwnMaterial:
 
 @dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber C01/(C10 + C01), and nu is 1/2; of plies their laminate, and nu is that of units.
+    """nu, and h over R; of rubber its numbers, and nu is 1/2; of plies their laminate, and nu is that of units.
 
     Several shells: `shells` is name -> material, and nu is that of the first; None if all have the same. `laws` has the
     law of each in their order, and `laminates` is name -> plies.
@@ -56,7 +58,7 @@ class Material:
 
     nu: float
     h: float
-    rubber: float | None = None
+    rubber: Rubberlike | None = None
     laminate: Laminate | None = None
     shells: Mapping[str, OwnMaterial] | None = None
     laws: tuple[Law, ...] = ()
@@ -69,6 +71,9 @@ class Material:
             return OfShells(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
         if self.laminate:
             return Laminated.of(self.laminate, self.h, self.nu)
+        if isinstance(self.rubber, tuple):
+            mu, alpha = self.rubber
+            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property

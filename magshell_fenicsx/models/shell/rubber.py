@@ -11,6 +11,7 @@ A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that
 Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see docs/theory.md, Rubber.
 """
 
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import ufl
@@ -19,9 +20,8 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered, trace
 
 
-@dataclass(frozen=True)
-class Rubber(Law):
-    """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
+class Incompressible(Law):
+    """What laws of rubber share: they say their energy, its derivatives by the strain, and a stiffness."""
 
     @property
     def thins(self) -> Scalar:
@@ -31,18 +31,9 @@ class Rubber(Law):
     def linear(self) -> Koiter:
         return Koiter(self.h, 0.5, self.t, self.e)
 
-    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        at = _Stretched(E, up)
-        return self.e * self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
-
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        at = _Stretched(E, up)
-        first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
-        second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
-        by_T, by_D = (
-            self.e * self.t / (6 * at.d) * ((1 - self.number) * one + self.number * two)
-            for one, two in zip(first, second, strict=True)
-        )
+        at = Stretched(E, up)
+        by_T, by_D = (self.e * self.t * slope for slope in self._slopes(at))
         adjugate = E[..., 1, 1], -E[..., 0, 1], E[..., 0, 0]
         a = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         S11, S12, S22 = (
@@ -51,16 +42,16 @@ class Rubber(Law):
         return S11, S12, S22
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        of_square, of_mixed, of_det = self._stiffness(at := _Stretched(E, up))
+        of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
-        T = at.deformed_trace(K)
-        return (of_square * T**2 - of_mixed * T * trace(K, up) - of_det * det) / 2
+        T, tau = at.deformed_trace(K), trace(K, up)
+        return (of_square * T**2 - of_mixed * T * tau - of_det * det + of_drawn * tau**2) / 2
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
-        of_square, of_mixed, of_det = self._stiffness(at := _Stretched(E, up))
+        of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
         T, tau = at.deformed_trace(K), trace(K, up)
         a, adjugate = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]), (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
-        by_T, by_tau = of_square * T - of_mixed / 2 * tau, -of_mixed / 2 * T
+        by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
         M11, M12, M22 = (
             by_T * raised + by_tau * once - of_det / 2 * turned
             for raised, once, turned in zip(at.inverse, a, adjugate, strict=True)
@@ -72,20 +63,45 @@ class Rubber(Law):
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        of_square, of_mixed, _ = self._stiffness(at := _Stretched(E, up))  # c c has no determinant
+        of_square, of_mixed, _, of_drawn = self._stiffness(at := Stretched(E, up))  # c c has no determinant
         (c1, c2), (a11, a12, a22) = lowered(across, up), at.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
-        return of_square * T**2 - of_mixed * T * square
+        return of_square * T**2 - of_mixed * T * square + of_drawn * square**2
 
-    def _stiffness(self, at: "_Stretched") -> tuple[Scalar, Scalar, Scalar]:
-        """What multiplies T^2, T tr K and det K in twice the energy of bending, T = a^ij K_ij with the deformed a."""
+    @abstractmethod
+    def _slopes(self, at: "Stretched") -> tuple[Scalar, Scalar]:
+        """The derivatives by T and D of the energy of stretching, per volume over E."""
+
+    @abstractmethod
+    def _stiffness(self, at: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """What multiplies T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending, T = a^ij K_ij with the
+        deformed a."""
+
+
+@dataclass(frozen=True)
+class Rubber(Incompressible):
+    """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        at = Stretched(E, up)
+        return self.e * self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
+
+    def _slopes(self, at: "Stretched") -> tuple[Scalar, Scalar]:
+        first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
+        second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
+        by_T, by_D = (
+            ((1 - self.number) * one + self.number * two) / (6 * at.d) for one, two in zip(first, second, strict=True)
+        )
+        return by_T, by_D
+
+    def _stiffness(self, at: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
         factor = self.e * self.t**3 * self.h**2 / 18 / at.d**2  # h^2/(12 d) times 4/6 and 1/d
         one, two, t = 1 - self.number, self.number, 2 + at.T
-        of_det = one + two * (t - _root(at.d))  # W'' has d^2 in place of the root
-        return factor * 2 * (one + two * t), factor * 2 * two, factor * 2 * of_det * at.up / at.d
+        of_det = one + two * (t - root(at.d))  # W'' has d^2 in place of the root
+        return factor * 2 * (one + two * t), factor * 2 * two, factor * 2 * of_det * at.up / at.d, 0
 
 
-class _Stretched:
+class Stretched:
     """A surface with a strain.
 
     Attributes
@@ -119,5 +135,6 @@ class _Stretched:
         return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
 
 
-def _root(x: Scalar) -> Scalar:
+def root(x: Scalar) -> Scalar:
+    """The square root."""
     return ufl.sqrt(x) if isinstance(x, Expr) else x**0.5

@@ -214,12 +214,17 @@ class Shape:
     def volume(self, first: Array, points: Array) -> Array:
         """Natural over undeformed volume (cells, places), of a surface with these tangents (2, cells, places, 3)."""
         assert self.stretch is not None
-        numbers = float(self.stretch.value) * at_quadrature(self.field, points)
+        return np.asarray(np.polynomial.polynomial.polyval(float(self.stretch.value), self.volumes(first, points)))
+
+    def volumes(self, first: Array, points: Array) -> Array:
+        """Its coefficients (4, cells, places) by powers of the amplitude of the stretch: det(1 + mu T) (1 + mu t)."""
+        numbers = at_quadrature(self.field, points)
         T = np.empty((*numbers.shape[:2], 3, 3))
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
         a = np.moveaxis(first, 0, -2)
         mixed = np.linalg.solve(a @ np.swapaxes(a, -1, -2), a @ T @ np.swapaxes(a, -1, -2))
-        return np.asarray(np.linalg.det(np.eye(2) + mixed) * (1 + numbers[..., 12]))
+        t, trace, det = numbers[..., 12], np.trace(mixed, axis1=-2, axis2=-1), np.linalg.det(mixed)
+        return np.array([np.ones_like(t), trace + t, det + trace * t, det * t])
 
     def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
         """The natural forms at a point where the field and the amplitudes have these values."""

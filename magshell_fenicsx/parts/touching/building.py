@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.gap import Grown
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
@@ -34,6 +35,7 @@ def touchings(
     thins: Array | int = 0,
     images: Sequence[Image] = (),
     on_planes: Sequence[NDArray[np.int32]] = (),
+    natural: Grown | None = None,
 ) -> list[Touching]:
     """The contacts of pairs; collective.
 
@@ -53,6 +55,8 @@ def touchings(
         Of a half or a sector the copies that make the whole, itself first; none of a whole.
     on_planes
         The sides of this rank's cells on their planes.
+    natural
+        The natural shape; None if it is the drawn one.
 
     Raises
     ------
@@ -85,20 +89,29 @@ def touchings(
     times, thinning = np.ones(nodes.shape), np.broadcast_to(np.asarray(thins) > 0, (local[1], 1))[:, 0]
     if thickness is not None:
         times = thickness.x.array[thickness.function_space.dofmap.list[:count]]
-    times, keeps_volume = cells_of_all.gathered(times), cells_of_all.gathered(thinning)
+    powers, grown = np.array([times]), None
+    if natural and natural.stretch is not None:
+        of_nodes = element.tabulate(1, element.points)[1:, ..., 0]
+        tangents = np.einsum("dqk,nki->dnqi", of_nodes, r0.x.array.reshape(-1, 3)[V.dofmap.list])
+        rates = natural.volumes(tangents, element.points)
+        rates[:, ~thinning] = np.eye(4)[0][:, None, None]
+        powers, grown = times * rates[:, :count], natural.stretch
+    powers, keeps_volume = np.array([cells_of_all.gathered(each) for each in powers]), cells_of_all.gathered(thinning)
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     own = 3 * index.local_range[0], 3 * index.size_local
     moved: Callable[[], Array] = partial(whole, u)
     kind: Callable[..., Touching] = Touching
+    same = np.arange(len(placed))
     if images:
         copies = Images(images, len(placed))
+        same = copies.shared(placed, _nodes(V, on_planes)).ravel()
         vertices = _vertices(topology, on_planes)
         cells, placed = copies.cells(cells, placed, vertices), copies.placed(placed)
         named = {name: copies.each(inside) for name, inside in named.items()}
-        times, keeps_volume = copies.each(times), copies.each(keeps_volume)
+        powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
-    faces = Faces(cells, placed, h, times, keeps_volume) if keeps_volume.any() else None
+    faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if keeps_volume.any() else None
     segments = Segments(cells, rule, X, weights, placed, element.degree)
     made = list[Touching]()
     for pair in pairs:
@@ -117,6 +130,13 @@ def touchings(
             )
         made.append(touching)
     return made
+
+
+def _nodes(V: fem.FunctionSpace, sides: Sequence[NDArray[np.int32]]) -> Longs:
+    """Global numbers of the nodes of sides of cells, of all ranks; collective."""
+    local = fem.locate_dofs_topological(V, 1, np.concatenate([*sides, np.empty(0, np.int32)]), remote=False)
+    numbers = V.dofmap.index_map.local_to_global(local)
+    return np.asarray(np.unique(over_ranks(V.mesh.comm, numbers)))
 
 
 def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Longs:

@@ -4,7 +4,8 @@ At each node it is the undeformed volume per deformed area of the cells around, 
 
     H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell gets thinner as it stretches, J0 where it does not,
 
-with J = |a_1 x a_2| of the cell at the node. Its derivatives by the displacement are exact.
+with J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the natural volume, a polynomial of the
+amplitude "natural_stretch". The derivatives by the displacement and by this are exact.
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 
 Array = NDArray[np.float64]
@@ -54,19 +56,48 @@ class Faces:
     h
         Thickness over R.
     thickness, thins
-        (cells, functions) what multiplies it at the nodes of each cell, and (cells,) whether it follows from the area.
+        (n, cells, functions) coefficients, by powers of the amplitude, of what multiplies it at the nodes of each cell,
+        and (cells,) whether it follows from the area.
+    same
+        (nodes,) for each node the first of those at its place: images share what is on their planes.
+    grown
+        The amplitude; None without.
+
+    Attributes
+    ----------
+    grown
+        The same.
     """
 
-    def __init__(self, cells: Cells, r0: Array, h: float, thickness: Array, thins: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        cells: Cells,
+        r0: Array,
+        h: float,
+        thickness: Array,
+        thins: NDArray[np.bool_],
+        same: Longs,
+        grown: Settable | None = None,
+    ) -> None:
         self._cells, self._r0, self._thins, self._thin = cells, r0, thins, np.flatnonzero(thins)
+        self._same, self.grown, self._places = same, grown, same[cells.nodes]
         self._table = cells.element.tabulate(1, cells.element.points)[1:, :, :, 0]
         J0 = self._areas(r0, slice(None))
-        self._volume = h / 2 * self._sum(slice(None), thickness * J0)
+        self._volumes = h / 2 * np.array([self._sum(slice(None), each * J0) for each in thickness])
         self._stays = self._sum(~thins, J0[~thins])
+
+    @property
+    def value(self) -> float:
+        """Of the amplitude at present."""
+        return float(self.grown.value) if self.grown is not None else 0.0
 
     def half(self, u: Array) -> Array:
         """(nodes,), over R, at a displacement (nodes, 3)."""
-        return np.asarray(self._volume / self._area(u))
+        return np.asarray(self._volume() / self._area(u))
+
+    def by_growth(self, u: Array, order: int = 1) -> Array:
+        """The derivative (nodes,) of H by the amplitude."""
+        return np.asarray(self._volume(order) / self._area(u))
 
     def slope(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
@@ -75,15 +106,20 @@ class Faces:
     def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
         area = self._area(u)
-        return scipy.sparse.diags_array(np.where(which, -self._volume / area**2, 0.0)) @ self._slopes(u, which)
+        return scipy.sparse.diags_array(np.where(which, -self._volume() / area**2, 0.0)) @ self._slopes(u, which)
+
+    def slope_by_growth(self, u: Array, f: Array) -> Array:
+        """The derivative (nodes, 3) of sum f dH, with dH by the amplitude."""
+        weight = -f * self._volume(1) / self._area(u) ** 2
+        return np.asarray((self._slopes(u, f != 0).T @ weight).reshape(-1, 3))
 
     def hessian(self, u: Array, f: Array) -> Any:
         """The sparse second derivative (3 nodes, 3 nodes) of sum f H."""
         some, area, by = self._around(f != 0), self._area(u), self._slopes(u, f != 0)
-        weight = -f * self._volume / area**2
+        weight = -f * self._volume() / area**2
         whole = by.T @ scipy.sparse.diags_array(-2 * weight / area) @ by
         at, nodes = self._tilted(u, some), self._cells.nodes[some]
-        T, slope, w = at.by_node, at.slope, weight[nodes]
+        T, slope, w = at.by_node, at.slope, np.bincount(self._same, weight, len(weight))[self._places[some]]
         H = np.einsum("cqmi,cqni->cmn", T * (w / at.J)[..., None, None], T)
         H -= np.einsum("cqm,cqn->cmn", slope * (w / at.J)[..., None], slope)
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -112,6 +148,11 @@ class Faces:
         i, j, v = scipy.sparse.find(by_u.T @ K @ by_u + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
 
+    def _volume(self, order: int = 0) -> Array:
+        """(h/2) sum V at all nodes, or a derivative of it by the amplitude."""
+        powers = np.polynomial.polynomial
+        return np.asarray(powers.polyval(self.value, powers.polyder(self._volumes, order)))
+
     def _area(self, u: Array) -> Array:
         return self._stays + self._sum(self._thin, self._areas(self._r0 + u, self._thin))
 
@@ -121,19 +162,22 @@ class Faces:
 
     def _sum(self, some: Any, values: Array) -> Array:
         """At nodes, of values (cells, functions) in some cells."""
-        return np.asarray(np.bincount(self._cells.nodes[some].ravel(), values.ravel(), len(self._r0)), dtype=float)
+        of_places = np.bincount(self._places[some].ravel(), values.ravel(), len(self._r0))
+        return np.asarray(of_places[self._same], dtype=float)
 
     def _around(self, which: NDArray[np.bool_]) -> Longs:
         """The cells with any of some nodes whose areas count."""
-        return np.flatnonzero(which[self._cells.nodes].any(axis=1) & self._thins)
+        at_places = np.bincount(self._same, which, len(which)) > 0
+        return np.flatnonzero(at_places[self._places].any(axis=1) & self._thins)
 
     def _slopes(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """Derivatives (nodes, 3 nodes) of the areas at some nodes."""
         some = self._around(which)
         nodes, slope = self._cells.nodes[some], self._tilted(u, some).slope
-        rows, columns = np.broadcast_arrays(nodes[:, :, None], unknowns(nodes, len(self._r0))[:, None, :])
+        places = self._places[some]
+        rows, columns = np.broadcast_arrays(places[:, :, None], unknowns(nodes, len(self._r0))[:, None, :])
         size = len(self._r0), self._r0.size
-        return scipy.sparse.coo_array((slope.ravel(), (rows.ravel(), columns.ravel())), size).tocsr()
+        return scipy.sparse.coo_array((slope.ravel(), (rows.ravel(), columns.ravel())), size).tocsr()[self._same]
 
     def _tilted(self, u: Array, some: Longs) -> _Tilted:
         a1, a2 = np.einsum("dqk,cki->dcqi", self._table, (self._r0 + u)[self._cells.nodes[some]])

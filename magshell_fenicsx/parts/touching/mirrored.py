@@ -68,20 +68,24 @@ class Images:
         on_planes
             Numbers of these vertices.
         """
-        vertices = int(cells.corners.max()) + 1
-        x = np.zeros((vertices, 3))
+        x = np.zeros((int(cells.corners.max()) + 1, 3))
         x[cells.corners] = np.einsum("ck,nki->nci", cells.element.tabulate(0, CORNERS)[0, :, :, 0], r0[cells.nodes])
-        images, extent = [image.of(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
-        numbers = np.arange(len(self.images) * vertices).reshape(-1, vertices)
-        for k, places in enumerate(images):
-            for before in range(k - 1, -1, -1):
-                same = np.linalg.norm(places - images[before], axis=1) < CLOSE * extent
-                numbers[k, on_planes[same]] = numbers[before, on_planes[same]]
+        numbers = self.shared(x, on_planes)
         return Cells(
             cells.element,
             np.concatenate([cells.nodes + k * self.count for k in range(len(self.images))]),
             np.concatenate([number[cells.corners] for number in numbers]),
         )
+
+    def shared(self, x: Array, on_planes: Longs) -> Longs:
+        """Numbers (copies, n) of the places (n, 3) of all copies, which share those on their planes."""
+        images, extent = [image.of(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
+        numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
+        for k, places in enumerate(images):
+            for before in range(k - 1, -1, -1):
+                same = np.linalg.norm(places - images[before], axis=1) < CLOSE * extent
+                numbers[k, on_planes[same]] = numbers[before, on_planes[same]]
+        return numbers
 
     def forces(self, whole: Array) -> Array:
         """Those (3 count,) on what is modelled, of forces on all copies."""
@@ -117,9 +121,9 @@ class Mirrored(Touching):
         other._images = replace(self._images, parity=-1.0)
         return other
 
-    def add_residual(self, b: Array, factor: float) -> None:
+    def _add(self, b: Array, forces: Array) -> None:
         whole = np.zeros(self._images.matrix.shape[0])
-        super().add_residual(whole, factor)
+        super()._add(whole, forces)
         start, size = self._part
         b[:size] += self._images.forces(whole)[start : start + size]
 

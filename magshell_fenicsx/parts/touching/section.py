@@ -156,8 +156,6 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface", "the same thickness everywhere")
-    if "a thickness that does not change" in context.withdrawn:  # faces are known by the undeformed volume
-        context.needs("contact of rubber", "the area as drawn")
     if symmetry == "axisymmetric":
         raise ValueError(
             "symmetry: axisymmetric: shells that may touch are modelled all around: take auto, half or none"

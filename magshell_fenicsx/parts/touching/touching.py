@@ -16,8 +16,9 @@ Shells that get thinner have half the thickness H at nodes as a fourth unknown: 
 less H(x), plus h, so that |x - y| need not be the least. H follows from the displacement (`Faces`).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
@@ -55,6 +57,23 @@ class Number:
     """A number that a state sets."""
 
     value: float
+
+
+@dataclass(frozen=True)
+class ByGrowth:
+    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
+
+    of: "Touching"
+    order: int = 1
+    amplitude: str | None = None
+
+    def energy(self) -> float:
+        """On this rank's part."""
+        return self.of.by_growth(self.order)
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor times the gradient of the first one; collective."""
+        self.of.add_by_growth(b, factor)
 
 
 class Touching:
@@ -104,6 +123,7 @@ class Touching:
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
+        self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places = rule, nowhere()
         self._joined = Joined.of(self._places, 1.0)
@@ -126,14 +146,63 @@ class Touching:
         return float(self._points.weight[at.point[joined.first]] @ value) / 2
 
     def add_residual(self, b: Array, factor: float) -> None:
-        whole = self._forces()
-        forces = whole[:, :3] + (self._faces.slope(self._at, whole[:, 3]) if self._faces else 0.0)
-        add_own(b, factor * forces, self._own, self._comm)
+        self._add(b, factor * self._on_nodes(self._forces()))
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
+        entries = self._by_parts()
+        return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+
+    # by what grows
+
+    def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+        """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
+        grown = self._faces.grown if self._faces else None
+
+        def twice(before: Twice, q: object) -> Sequence[Derivative]:
+            return [*before(q), *([ByGrowth(self, 2)] if q is grown else [])]
+
+        return {
+            name: replace(p, slopes=[*p.slopes, ByGrowth(self)], twice=partial(twice, p.twice))
+            for name, p in parameters.items()
+            if p.constant is grown
+        }
+
+    def by_growth(self, order: int = 1) -> float:
+        """The first or second derivative of this rank's energy by the natural stretch."""
+        forces = self._forces()[:, 3]
+        of_forces = float(self._changed()[:, 3] @ self._growth()) if order == 2 else 0.0
+        return of_forces + float(forces @ self._growth(order))
+
+    def add_by_growth(self, b: Array, factor: float) -> None:
+        """Add a factor times that of its gradient; collective."""
+        assert self._faces
+        forces = self._on_nodes(self._changed()) + self._faces.slope_by_growth(self._at, self._forces()[:, 3])
+        self._add(b, factor * forces)
+
+    def _growth(self, order: int = 1) -> Array:
+        assert self._faces
+        return self._faces.by_growth(self._at, order)
+
+    def _changed(self) -> Array:
+        """What the forces (nodes, 4) change by as the faces grow and nothing moves."""
+        rows, columns, values = self._by_parts()
+        along = np.concatenate([np.zeros(self._r0.size), self._growth()])
+        product = np.bincount(rows, values * along[columns], len(along))
+        return np.column_stack([product[: self._r0.size].reshape(-1, 3), product[self._r0.size :]])
+
+    def _on_nodes(self, forces: Array) -> Array:
+        """The forces (nodes, 3) by the displacement, of those by place and thickness."""
+        return forces[:, :3] + (self._faces.slope(self._at, forces[:, 3]) if self._faces else 0.0)
+
+    def _add(self, b: Array, forces: Array) -> None:
+        """Add forces (nodes, 3) of this rank's points; collective."""
+        add_own(b, forces, self._own, self._comm)
+
+    def _by_parts(self) -> Entries:
+        """Those of the second derivative by place and thickness."""
         whole, joined, (_, of_group, bend) = self._pressed()
         number, several = len(self._cells.nodes), joined.several
         first = of_group[joined.group]
@@ -162,8 +231,7 @@ class Touching:
         if several.any():
             i, j, v = self._between(whole, joined, of_group, bend)
             rows, columns, values = [*rows, i], [*columns, j], [*values, v]
-        entries = np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-        return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     # what is seen
 
@@ -280,10 +348,10 @@ class Touching:
     def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
-        u = self._now()
+        u, grown = self._now(), self._faces.value if self._faces else 0.0
         points = self._cuts.points(self.cuts.value, u)
-        if points is not self._points or not np.array_equal(u, self._at):
-            self._points = points
+        if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
+            self._points, self._grown = points, grown
             self._places, self._at = self._facing.found(u, (1 + SAME) * self._h, points), np.array(u)
             self._joined = Joined.of(self._places, BLUR * self._h)
         joined = self._joined

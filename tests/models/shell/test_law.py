@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ufl
+from ogdens import TRELOAR
 from plies import laminate, ply
 
 from magshell_fenicsx.models.shell.laminate import Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, work
+from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.rubber import Rubber
 
 COUPLED = Laminated.of(laminate(ply(20, 3.0, fraction=0.3), ply(-70, 0.7)), 0.05, 0.3)
@@ -17,6 +19,7 @@ LAWS: list[Law] = [
     Koiter(0.1, 0.5).thicker(1.3),
     Rubber(0.05, 0.0),
     Rubber(0.1, 0.3).thicker(1.3),
+    Ogden(0.1, 0.0, mu=TRELOAR[0], alpha=TRELOAR[1]).thicker(1.3),
     replace(COUPLED, direction=(0.3, -0.8)).thicker(1.3),
 ]
 RNG, STEP = np.random.default_rng(4), 1e-30

@@ -1,0 +1,127 @@
+"""Ogden's rubber: the energy per volume is sum mu_p/alpha_p (l1^alpha_p + l2^alpha_p + l3^alpha_p - 3).
+
+R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565. Principal stretches have no derivatives where they are equal, their
+sum has: with d = det C, t = tr C, a = alpha/2 and 1 + w = t/(2 sqrt(d)) the squares of both stretches are
+sqrt(d) exp(+-u) with cosh u = 1 + w, so that
+
+    l1^alpha + l2^alpha = 2 d^(a/2) (1 + V(w)),   V = cosh(a u) - 1,   w (2 + w) V'' + (1 + w) V' = a^2 (1 + V),
+
+where V is Chebyshev's function of the order a, less one: a power series in w that is cut off where w is small.
+
+Of the energy of bending see docs/theory.md, Rubber.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+import ufl
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.shell.law import Scalar, Tensor
+from magshell_fenicsx.models.shell.rubber import Incompressible, Stretched, root
+
+SMALL, TERMS = 0.02, 10  # w below which the series is taken, and its terms: the next is below 1e-20
+
+
+@dataclass(frozen=True)
+class Ogden(Incompressible):
+    """Its number is not used.
+
+    Attributes
+    ----------
+    mu, alpha
+        Of each term, mu over E: the sum of mu alpha is 2/3, and each mu alpha positive.
+    """
+
+    mu: Any = field(default=(), kw_only=True)
+    alpha: tuple[float, ...] = field(default=(), kw_only=True)
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        return self.h, self.number, self.mu
+
+    def with_numbers(self, *numbers: Any) -> Self:
+        h, number, mu = numbers
+        return type(self)(h, number, mu=mu, alpha=self.alpha)
+
+    @property
+    def terms(self) -> list[tuple[Scalar, float]]:
+        """mu and alpha of each."""
+        return [(self.mu[i], alpha) for i, alpha in enumerate(self.alpha)]
+
+    @property
+    def softening(self) -> float:
+        """How much of the stress is taken into the stiffness of bending, so that it is positive at every stretch."""
+        return max(0.0, 2 - min(abs(alpha) for alpha in self.alpha))
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        at, total = Stretched(E, up), 0.0
+        for mu, alpha in self.terms:
+            z, (V, _, _) = at.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(at))
+            total = total + mu / alpha * ((z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V)  # of order one is nothing
+        return self.e * self.t * total
+
+    def _slopes(self, at: Stretched) -> tuple[Scalar, Scalar]:
+        w, by_t, by_d = _uneven(at), 0.0, 0.0
+        for mu, alpha in self.terms:
+            a = alpha / 2
+            V, V1, _ = _chebyshev(a, w)
+            by_t = by_t + mu / alpha * at.d ** ((a - 1) / 2) * V1
+            by_d = by_d + mu / alpha / at.d * (at.d ** (a / 2) * (a * (1 + V) - (1 + w) * V1) - a * at.d**-a)
+        return by_t + by_d, by_d
+
+    def _stiffness(self, at: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        w, soft = _uneven(at), self.softening
+        y, square, mixed, drawn, even = 1 + w, 0.0, 0.0, 0.0, 0.0
+        for mu, alpha in self.terms:
+            a = alpha / 2
+            V, V1, V2 = _chebyshev(a, w)
+            z, m = at.d ** (a / 2), mu / alpha
+            by_d, by_both = a * (1 + V) - y * V1, (a - 1) * V1 - y * V2
+            drawn = drawn + 2 * m * z * V2
+            mixed = mixed + m * z * (4 * by_both + 2 * soft * V1)
+            in_surface = (2 * a - 4 + 2 * soft) * by_d - 2 * y * by_both
+            square = square + m * (z * in_surface + (4 * a * (a + 1) - 2 * a * soft) / z**2)
+            even = even + 4 * a * m * ((a - 1 + soft / 2) * z + (a + 1 - soft / 2) / z**2)
+        across = drawn + y * mixed + square
+        of_det = 2 * across**2 / (across + even)
+        factor = self.e * self.t**3 * self.h**2 / (12 * at.d)
+        s = root(at.d)
+        return factor * square, -factor * mixed / s, factor * of_det * at.up / at.d, factor * drawn / at.d
+
+
+def _uneven(at: Stretched) -> Scalar:
+    """w = t/(2 sqrt(d)) - 1, in which no numbers of order one are subtracted: (t^2/4 - d)/(sqrt(d) (t/2 + sqrt(d)))."""
+    s = root(at.d)
+    return (at.T**2 / 4 - at.D) / (s * (1 + at.T / 2 + s))
+
+
+def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """V(w) of the order a, and two derivatives."""
+    c = [0.0, a**2]
+    for k in range(1, TERMS):
+        c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
+    series = [_horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w) for n in range(3)]
+    if a == int(a) and abs(a) <= TERMS:  # a polynomial
+        return series[0], series[1], series[2]
+    small = ufl.lt(w, SMALL) if isinstance(w, Expr) else np.real(w) < SMALL
+    far = _where(small, SMALL, w)
+    y = 1 + far
+    p = (y + root(far * (2 + far))) ** a
+    V = (p + 1 / p) / 2 - 1
+    V1 = a * (p - 1 / p) / (2 * root(far * (2 + far)))
+    V2 = (a**2 * (1 + V) - y * V1) / (far * (2 + far))
+    one, two, three = (_where(small, near, f) for near, f in zip(series, (V, V1, V2), strict=True))
+    return one, two, three
+
+
+def _horner(c: list[float], w: Scalar) -> Scalar:
+    total: Scalar = float(c[-1])
+    for each in reversed(c[:-1]):
+        total = total * w + float(each)
+    return total
+
+
+def _where(small: Any, one: Scalar, two: Scalar) -> Scalar:
+    return ufl.conditional(small, one, two) if isinstance(small, Expr) else np.where(small, one, two)
