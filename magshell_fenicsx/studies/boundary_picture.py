@@ -11,8 +11,13 @@ from magshell_fenicsx.output.pictures.lines import smooth
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.naming import key_label
 
-MARKS = {"cusp": "o", "turn": "s", "meeting": "D"}
-WORDS = {"cusp": "cusp", "turn": "turning point", "meeting": "second mode neutral"}
+MARKS = {"cusp": "o", "turn": "s", "meeting": "D", "crossing": "X"}
+WORDS = {
+    "cusp": "cusp",
+    "turn": "turning point",
+    "meeting": "second mode neutral",
+    "crossing": "two bifurcations cross",
+}
 LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 Row = Mapping[str, Any]
 
@@ -141,7 +146,16 @@ def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[fl
 
 
 def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
-    """Places and names of the regions."""
+    """Places and names of the regions; beyond a boundary of several modes each has its own."""
+    parts, whole = _by_mode(rows), _beside(rows, content, limits)
+    if len(parts) < 2:
+        return whole
+    lost = [_beside(part, {**content, "mode": mode}, limits) for mode, part in parts]
+    return [each for each in whole if each[2] == "stable"] + [of_part[0] for of_part in lost if of_part]
+
+
+def _beside(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
+    """The same of a boundary with one mode."""
     lost = "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
     crossed = sorted(
@@ -161,6 +175,14 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
         if content["kind"] != "fold":
             named[0] = (x, (last + outer) / 2, "stable")
     return named
+
+
+def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """The modes one after the other, each with its rows and the crossings at their ends."""
+    ends = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
+    parts = ([*rows[a : b + 1]] for a, b in pairwise([0, *ends, len(rows) - 1]))
+    named = ((next((row["mode"] for row in part if row["kind"] != "crossing"), ""), part) for part in parts)
+    return [(mode, part) for mode, part in named if mode]
 
 
 def _mode(mode: str) -> str:
