@@ -286,7 +286,7 @@ class Boundary:
         close = CLOSE**2 if self.m else CLOSE
         looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
         s = length / 2
-        while len(looked_at) < MOST_LOOKS:
+        for _ in range(MOST_LOOKS):
             guess = self._hermite(low, high, length, s / length)
             tried = self._looked_at(low, guess, s, family)
             if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in looked_at):
@@ -296,9 +296,10 @@ class Boundary:
             s = (a + b) / 2
             if len(looked_at) > 1:
                 ahead = _interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
-                s = ahead if a < ahead < b else s
-                if abs(s - looked_at[0][0]) < close * length:
+                if abs(ahead - looked_at[0][0]) < close * length:
+                    s = ahead
                     break
+                s = ahead if a < ahead < b else s
         if len(looked_at) < 2:
             return looked_at[0][2] if looked_at else None
         places, mu = [each[0] for each in looked_at], self.name

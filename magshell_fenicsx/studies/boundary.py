@@ -362,7 +362,7 @@ def _row(varied: Varied, label: Label, locus: Locus, m: int) -> dict[str, Any]:
         "kind": label if label in SPECIAL else varied.kind,
         "mode": ", ".join(f"{WAVES}{each}" for each in waves) if m else varied.mode,
         "error": float(locus.load_error),
-        "unstable": int(locus.unstable),
+        "unstable": int(locus.unstable - (locus.counts[locus.met] if label == "crossing" else 0)),
         "factorisations": int(locus.factorisations),
         **{name: float(number) for name, number in measured.items()},
     }
