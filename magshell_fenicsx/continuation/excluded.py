@@ -67,7 +67,8 @@ class ExcludedLines:
         of_family = family.factored(p, state, m)
         y = of_family.solve(b)
         compliance = dot(comm, b, y)
-        self.v, self.g = y / compliance, -1 / compliance
+        self.v: Vector = np.asarray(y / compliance)
+        self.g = -1 / compliance
         counts[m - 1] = of_family.negative_pivots - (compliance < 0)
         self.counts = [self._factors.negative_pivots, *counts]
         self.unstable = sum(self.counts)
