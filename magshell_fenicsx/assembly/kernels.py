@@ -1,4 +1,8 @@
-"""Compilation: forms by dolfinx, functions at points by ours, and the time that both take."""
+"""Compilation: forms by dolfinx, functions at points by ours, and the time that both take.
+
+Scenes that differ by numbers have the same forms. Within a process each is compiled or loaded once, known by the form
+that it is derived from: derivatives of another scene are neither formed nor signed again.
+"""
 
 import ctypes
 import time
@@ -11,6 +15,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
+from magshell_fenicsx.platform import compat
 from magshell_fenicsx.platform.compiler import check_room, library
 from magshell_fenicsx.platform.kept import compiling, kernel_cache
 from magshell_fenicsx.platform.processes import from_first
@@ -18,6 +23,90 @@ from magshell_fenicsx.platform.processes import from_first
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
 JIT_OPTIONS: dict[str, Any] = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math"], "timeout": 600}
+
+
+Key = tuple[str, str, int]
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A compiled form apart from its mesh: the places of its fields and numbers among those of what it is made from."""
+
+    kernels: compat.Kernels
+    fields: list[int]
+    numbers: list[int]
+    rank: int
+
+
+_known: dict[Key, _Known] = {}
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A form that is made from another one.
+
+    Attributes
+    ----------
+    of
+        The other form.
+    how
+        What is made of it: with the signature of `of` and the place of `u` this determines the form.
+    make
+        Makes it.
+    u
+        The field that it is derived by, whose space its arguments have; None for `of` itself.
+    factor
+        A number that `of` has not.
+    """
+
+    of: ufl.Form
+    how: str
+    make: Callable[[], ufl.Form]
+    u: fem.Function | None = None
+    factor: tuple[fem.Constant, ...] = ()
+
+    @property
+    def key(self) -> Key | None:
+        """None if it is known by nothing."""
+        if not isinstance(self.of, ufl.Form) or self.of.empty() or len(self.of.ufl_domains()) != 1:
+            return None
+        if self.u is None:
+            return self.of.signature(), self.how, -1
+        place = _place(self.u, self.of.coefficients())
+        return None if place is None else (self.of.signature(), self.how, place)
+
+    @property
+    def numbers(self) -> list[fem.Constant]:
+        return [*self.of.constants(), *self.factor]
+
+    def bound(self, known: _Known) -> fem.Form:
+        """The compiled form on the mesh, with the fields and numbers of this one."""
+        fields, numbers = self.of.coefficients(), self.numbers
+        spaces = [each.ufl_function_space() for each in self.of.arguments()]
+        if self.u is not None:
+            spaces = [self.u.function_space] * known.rank
+        of_mesh = self.of.subdomain_data()[self.of.ufl_domain()]
+        return compat.bound(
+            known.kernels,
+            spaces,
+            [fields[i] for i in known.fields],
+            [numbers[i] for i in known.numbers],
+            {kind: data[0] for kind, data in of_mesh.items()},
+            self.of.ufl_domain().ufl_cargo(),
+        )
+
+    def known(self, made: ufl.Form, compiled: fem.Form) -> _Known | None:
+        """What is kept of the compiled form; None if it has other fields or numbers."""
+        kernels = compat.kernels_of(compiled)
+        fields = [_place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())]
+        numbers = [_place(each, self.numbers) for each in made.constants()]
+        if None in fields or None in numbers:
+            return None
+        return _Known(kernels, fields, numbers, compiled.rank)  # type: ignore[arg-type]
+
+
+def _place(one: Any, among: Iterable[Any]) -> int | None:
+    return next((i for i, each in enumerate(among) if each is one), None)
 
 
 @dataclass
@@ -29,6 +118,25 @@ class KernelLog:
 
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
         """Compile a form, or load it from the cache."""
+        return self.derived(name, Derived(expression, "", lambda: expression))
+
+    def derived(self, name: str, form: Derived) -> fem.Form:
+        """Compile a form, or take what this process has compiled; collective."""
+        key = form.key
+        if key is None:
+            return self._compiled(name, form.make())
+        comm, start = form.of.ufl_domain().ufl_cargo().comm, time.perf_counter()
+        if comm.allreduce(key in _known, MPI.LAND):  # ranks may have compiled others alone
+            bound = form.bound(_known[key])
+            self._note(name, start)
+            return bound
+        made = form.make()
+        compiled = self._compiled(name, made)
+        if isinstance(made, ufl.Form) and compiled is not None and (known := form.known(made, compiled)):
+            _known[key] = known
+        return compiled
+
+    def _compiled(self, name: str, expression: ufl.Form) -> fem.Form:
         start, folder = time.perf_counter(), kernel_cache()
         try:
             with compiling(folder):

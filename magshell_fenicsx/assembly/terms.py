@@ -1,6 +1,6 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.following import PointField
-from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.kernels import Derived, KernelLog
 from magshell_fenicsx.platform import compat
 
 Density = TypeVar("Density")  # the type of a form's density
@@ -103,23 +103,32 @@ class FormTerm:
 
     @cached_property
     def residual_form(self) -> fem.Form:
-        return self._log.compile(f"{self.name} residual", self._factor * self._gradient)
+        return self._derived("residual", lambda: self._factor * self._gradient)
 
     @cached_property
     def tangent_form(self) -> fem.Form | None:
-        if self.linear:
-            return None
-        hessian = self._hessian
-        if not self.has_potential:
-            hessian = 0.5 * (hessian + ufl.adjoint(hessian))
-        return self._log.compile(f"{self.name} tangent", self._factor * hessian)
+        return None if self.linear else self._derived("tangent", lambda: self._factor * self._symmetric)
 
     @cached_property
     def skew_form(self) -> fem.Form | None:
         if self.has_potential:
             return None
+
+        def skew() -> ufl.Form:
+            hessian = self._hessian
+            return self._factor / 2 * (hessian - ufl.adjoint(hessian))
+
+        return self._derived("skew tangent", skew)
+
+    def _derived(self, what: str, make: Callable[[], ufl.Form]) -> fem.Form:
+        of = self.form if self._work is None else self._work
+        how = what if self._work is None else f"{what} of work"
+        return self._log.derived(f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,)))
+
+    @property
+    def _symmetric(self) -> ufl.Form:
         hessian = self._hessian
-        return self._log.compile(f"{self.name} skew tangent", self._factor / 2 * (hessian - ufl.adjoint(hessian)))
+        return hessian if self.has_potential else 0.5 * (hessian + ufl.adjoint(hessian))
 
     @property
     def _hessian(self) -> ufl.Form:

@@ -124,9 +124,10 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None
         varying = [each.finer(case.mesh.refinement) for each in varying]
     size = grading(context, drawn, material.h, [*local, *touched], everywhere, loaded, varying, local=bool(local))
     drawn = imperfect(perfect, imperfections, turn, still)
-    if isinstance(beyond, Sector):
-        size = towards_tip(size, beyond)
     shape = drawn.chart(beyond, size)
+    if isinstance(beyond, Sector) and not isinstance(shape, Grid):  # a ring has no tip
+        size = towards_tip(size, beyond)
+        shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))

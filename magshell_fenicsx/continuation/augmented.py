@@ -66,6 +66,10 @@ class Locus:
         Null vector of K, of length one, the same way along the whole boundary.
     unstable
         Number of unstable directions besides `phi`.
+    counts
+        The same by families: of the model, then of those of modes that it excludes, where these are looked at.
+    met
+        Where two instabilities cross the family of the other one, a place in `counts`.
     way
         Tangent of the boundary, of length one.
     cubic, pull
@@ -86,6 +90,8 @@ class Locus:
     second: float
     load_error: float
     factorisations: int
+    counts: Sequence[int] = ()
+    met: int = 0
 
 
 @dataclass(frozen=True)
@@ -101,8 +107,11 @@ class Row:
 class Lines:
     """The rows of Newton's step at a state, with what its columns take: du = alpha v - w_R - dmu w_mu - dp w_p."""
 
+    counts: Sequence[int] = ()
+
     def __init__(
         self,
+        kind: Kind,
         system: System,
         state: State,
         name: str,
@@ -112,7 +121,7 @@ class Lines:
         beside: Sequence[tuple[float, float]],
         scales: tuple[float, float],
     ) -> None:
-        self._scales, self._largest = scales, 0.0
+        self._kind, self._scales, self._largest = kind, scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
         own = {name: state.mu[name]}
         self._others = [(weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside]
@@ -123,6 +132,8 @@ class Lines:
         d = offset(system, v)
         ahead, back = (system.residual(u + way * d * v, mu) for way in (1, -1))
         self.cubic = np.asarray((back - 2 * self._R + ahead) / d**2)
+        self.v, self.unstable = v, tangent.unstable
+        self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
         R_p, self.K_p_v = self._derivatives_by_p([p == q for _, q in beside], d, ahead, back)
         self.w_p, self.t_p = tangent.solve(R_p)
@@ -143,12 +154,16 @@ class Lines:
         """Take the residual at a state close by, with the same factors."""
         self.w_R, self.t_R = self._tangent.solve(residual)
 
-    def step(self, kind: Kind, row: Row, value: float | None, *, settled: bool = False) -> Way:
+    def eigenvalue(self, family: int, p: float, state: State) -> float:
+        """The eigenvalue nearest to zero across b, of the model's own modes, with the factors of the last step."""
+        return second_eigenvalue(self._tangent, self._system)
+
+    def step(self, row: Row, value: float | None, *, settled: bool = False) -> Way:
         """Newton's step to the point on which a row has the value zero; without a value the tangent of the curve.
 
         `settled` takes only the residual and the row as not yet zero.
         """
-        comm, v, t = self._system.comm, self._tangent.v, self._tangent
+        kind, comm, v, t = self._kind, self._system.comm, self._tangent.v, self._tangent
         w_R, t_R = (self.w_R, self.t_R) if value is not None else (0.0 * v, 0.0)
         g, pull = (t.g, self.t_mu) if value is not None and not settled else (0.0, 0.0)
 

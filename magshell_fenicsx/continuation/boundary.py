@@ -1,22 +1,25 @@
 """The boundary of stability: a fold or a bifurcation followed in a second number p, through turning points.
 
-Both are curves in (u, mu, p), see `augmented`, which are followed by arc length; cubics predict. Along folds
-v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v alone, a cusp, at which
-v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
+Both are curves in (u, mu, p), see `augmented` and, of modes that the model excludes, `excluded`. They are followed by
+arc length; cubics predict. Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes
+along v alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import Literal, cast
 
 import numpy as np
 from scipy.interpolate import barycentric_interpolate
 
-from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way, second_eigenvalue
+from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way
+from magshell_fenicsx.continuation.excluded import ExcludedLines, Excluding
 from magshell_fenicsx.continuation.fold import AugmentedTangent
+from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
-Label = Literal["start", "point", "cusp", "turn", "meeting", "end"]
+Label = Literal["start", "point", "cusp", "turn", "meeting", "crossing", "end"]
 TOLERANCE = 1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
 LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
 MOST_ITERATIONS = 8
@@ -31,6 +34,7 @@ SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
 MOST_TRIALS, MOST_POINTS = 12, 400
 MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
 ROUNDING = 1e-12  # relative, of an amplitude
+LAST, APART = 3, 1e-3  # points whose systems give a slope by p, and their distance at least, over the range
 
 
 class BoundaryLost(RuntimeError):
@@ -48,19 +52,23 @@ class Boundary:
         Of the amplitude and of p: changes that count as of order one in the arc length.
     recorded
         Gets each solve, and gives its result or that of an interrupted boundary at this place.
+    m
+        The family of modes that the model excludes in which the bifurcation is; 0: it is one of the model itself.
     """
 
     def __init__(
         self,
-        family: Family,
+        family: Family | Excluding,
         name: str,
         kind: Kind,
         scales: tuple[float, float],
         recorded: "Callable[[Callable[[], Locus | str]], Locus | str]" = lambda solve: solve(),
+        m: int = 0,
     ) -> None:
-        self.family, self.name, self.kind, self.scales = family, name, kind, scales
+        self.family, self.name, self.kind, self.scales, self.m = family, name, kind, scales, m
         self._recorded = recorded
         self._weight = 0.0
+        self._solved_at = list[float]()
 
     def inner(self, a: Way, b: Way) -> float:
         """<a, b>: root mean square of u over the length, and the numbers over their scales."""
@@ -143,8 +151,15 @@ class Boundary:
             turn = self._stationary(low, high, length)
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
             yield "cusp" if is_cusp else "turn", turn
-        if low.unstable != high.unstable and (met := self._meeting(low, high, length)):
-            yield "meeting", met
+        if not self.m:
+            if low.unstable != high.unstable and (met := self._meeting(low, high, length, lambda one: one.unstable)):
+                yield "meeting", met
+            return
+        changed = [i for i, (a, b) in enumerate(zip(low.counts, high.counts, strict=True)) if a != b]
+        met_by = {i: self._meeting(low, high, length, partial(_count, i), i) for i in changed}
+        for i, met in sorted(met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0):
+            if met:
+                yield ("crossing" if i else "meeting"), replace(met, met=i)
 
     def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
         """The point after a step: by the cubic through the last two points and their tangents."""
@@ -191,7 +206,7 @@ class Boundary:
         off = Way(there.state.u - here.state.u, there.state.mu[name] - here.state.mu[name], there.p - here.p)
         return self.inner(here.way, off)
 
-    def _at_distance(self, base: Locus, guess: Way, length: float, *, look: bool = False) -> Locus | str:
+    def _at_distance(self, base: Locus, guess: Way, length: float, *, look: int | None = None) -> Locus | str:
         """The point at a distance along the tangent of another one."""
         way, (mu, p), name = base.way, self.scales, self.name
 
@@ -201,8 +216,14 @@ class Boundary:
         row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
         return self._tried(base, guess, length, row, look=look)
 
+    def _looked_at(self, base: Locus, guess: Way, s: float, family: int) -> Locus | str:
+        """A point with the eigenvalue of a family; where families do not couple, at a given p if that is cheaper."""
+        if not (self.m and self._at_given_p(base)):
+            return self._at_distance(base, guess, s, look=family)
+        return self._tried(base, guess, s, Row(None, 0.0, 1.0, lambda u, mu, p: p - guess.dp), look=family, rough=True)
+
     def _tried(
-        self, base: Locus, guess: Way, length: float, row: Row, *, look: bool = False, rough: bool = False
+        self, base: Locus, guess: Way, length: float, row: Row, *, look: int | None = None, rough: bool = False
     ) -> Locus | str:
         name = self.name
         point = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look, rough=rough)
@@ -254,25 +275,31 @@ class Boundary:
             low, high, a, b = (middle, high, s, b) if middle.way.dp * low.way.dp > 0 else (low, middle, a, s)
         return best
 
-    def _meeting(self, low: Locus, high: Locus, length: float) -> Locus | None:
-        """Where a second eigenvalue is zero between two points, by inverse interpolation.
+    def _meeting(
+        self, low: Locus, high: Locus, length: float, count: Callable[[Locus], int], family: int = 0
+    ) -> Locus | None:
+        """Where a second eigenvalue, of a family, is zero between two points, by inverse interpolation.
 
-        The bordered tangent is singular there, so the point itself is interpolated between others close by.
+        The bordered tangent may be singular there, so the point itself is interpolated between others close by; where
+        families do not couple it is not, and these may be closer.
         """
+        close = CLOSE**2 if self.m else CLOSE
         looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
         s = length / 2
-        while len(looked_at) < MOST_LOOKS:
-            tried = self._at_distance(low, self._hermite(low, high, length, s / length), s, look=True)
+        for _ in range(MOST_LOOKS):
+            guess = self._hermite(low, high, length, s / length)
+            tried = self._looked_at(low, guess, s, family)
             if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in looked_at):
                 break
             looked_at = sorted([*looked_at, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
-            a, b = (s, b) if tried.unstable == low.unstable else (a, s)
+            a, b = (s, b) if count(tried) == count(low) else (a, s)
             s = (a + b) / 2
             if len(looked_at) > 1:
                 ahead = _interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
-                s = ahead if a < ahead < b else s
-                if abs(s - looked_at[0][0]) < CLOSE * length:
+                if abs(ahead - looked_at[0][0]) < close * length:
+                    s = ahead
                     break
+                s = ahead if a < ahead < b else s
         if len(looked_at) < 2:
             return looked_at[0][2] if looked_at else None
         places, mu = [each[0] for each in looked_at], self.name
@@ -280,6 +307,15 @@ class Boundary:
         p, load = _interpolated(places, [each[2].p for each in looked_at], s), _interpolated(places, loads, s)
         error = abs(load - _interpolated(places[:-1], loads[:-1], s))
         return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
+
+    def _lines(
+        self, newton: BorderedNewton, state: State, b: Vector, p: float, beside: Sequence[tuple[float, float]]
+    ) -> Lines | ExcludedLines:
+        """The rows of Newton's step at a state."""
+        if self.m:
+            return ExcludedLines(newton, state, self.name, b, self.m, cast(Excluding, self.family), p, beside)
+        tangent = AugmentedTangent(newton, state, b)
+        return Lines(self.kind, newton.system, state, self.name, tangent, self.family, p, beside, self.scales)
 
     def _solved(
         self,
@@ -289,7 +325,7 @@ class Boundary:
         row: Row,
         near: Locus | None,
         *,
-        look: bool = False,
+        look: int | None = None,
         rough: bool = False,
     ) -> Locus | str:
         """The point near a guess on which a row holds, or the reason why there is none."""
@@ -300,24 +336,34 @@ class Boundary:
             except NoSystem as e:
                 return str(e)
 
-        return self._recorded(by_newton)
+        found = self._recorded(by_newton)
+        if isinstance(found, Locus):
+            self._solved_at.append(found.p)
+        return found
+
+    def _beside(self, p: float, *, rough: bool) -> Sequence[tuple[float, float]]:
+        """Weights and values of p of a difference by p; a rough one from the last points, which have their systems."""
+        places = [p]
+        for q in reversed(self._solved_at):
+            if min(abs(q - place) for place in places) > APART * self.scales[1] and len(places) <= LAST:
+                places.append(q)
+        return _slope(places) if rough and len(places) > LAST else self.family.beside(p, rough=rough)
 
     def _iterated(
-        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: bool, rough: bool
+        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: int | None, rough: bool
     ) -> Locus | str:
         u, mu, name = state.u, float(state.mu[self.name]), self.name
-        beside = self.family.beside(p, rough=rough)
+        beside = self._beside(p, rough=rough)
         sizes, changes = list[float](), list[float]()
         while True:
             newton = self.family.at(p)
             system, latest = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
-                tangent = AugmentedTangent(newton, latest, b)
-                lines = Lines(system, latest, name, tangent, self.family, p, beside, self.scales)
-                way = lines.step(self.kind, row, row.value(u, mu, p))
+                lines = self._lines(newton, latest, b, p, beside)
+                way = lines.step(row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"
-            b = tangent.v
+            b = lines.v
             sizes.append(max_abs(system.comm, way.du) / system.length)
             changes.append(abs(way.dmu))
             if not (sizes[-1] <= LARGEST_STEP and np.isfinite(way.dmu + way.dp)):
@@ -335,7 +381,7 @@ class Boundary:
                 return f"Newton's method has not converged in {MOST_ITERATIONS} iterations"
         last = self.family.at(p).system
         lines.balance(last.residual(u, {**self.family.amplitudes(p), name: mu}))
-        rest_of = lines.step(self.kind, row, row.value(u, mu, p), settled=True)
+        rest_of = lines.step(row, row.value(u, mu, p), settled=True)
         u, mu, p = u + rest_of.du, float(mu + rest_of.dmu), float(p + rest_of.dp)
         v = b / np.sqrt(dot(system.comm, b, b))
         if near is not None:
@@ -343,23 +389,37 @@ class Boundary:
             if abs(cosine) < ALIKE:
                 return "the null vector is another one"
             v = v * np.sign(cosine)
-        direction = lines.step(self.kind, row, None)
+        direction = lines.step(row, None)
         norm = np.sqrt(self.inner(direction, direction))
         if near is not None and self.inner(direction, near.way) < 0:
             norm = -norm
-        scale = dot(system.comm, tangent.v, v)
+        scale = dot(system.comm, lines.v, v)
+        state = State(u, {**self.family.amplitudes(p), name: mu})
         return Locus(
             p=p,
-            state=State(u, {**self.family.amplitudes(p), name: mu}),
+            state=state,
             phi=np.asarray(v),
-            unstable=tangent.unstable,
+            unstable=lines.unstable,
+            counts=lines.counts,
             way=Way(direction.du / norm, direction.dmu / norm, direction.dp / norm),
-            cubic=dot(system.comm, lines.cubic, tangent.v) / scale**3,
-            pull=lines.t_mu / scale,
-            second=second_eigenvalue(tangent, system) if look else np.nan,
+            cubic=lines.bend / scale**3,
+            pull=lines.pull / scale,
+            second=np.nan if look is None else lines.eigenvalue(look, p, state),
             load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
             factorisations=len(sizes),
         )
+
+
+def _slope(places: Sequence[float]) -> list[tuple[float, float]]:
+    """Weights and places of the slope at the first place of the polynomial through all."""
+    off = np.array(places) - places[0]
+    scale = np.abs(off).max()
+    weights = np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
+    return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
+
+
+def _count(family: int, locus: Locus) -> int:
+    return locus.counts[family]
 
 
 def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:

@@ -1,12 +1,15 @@
 """The calls that differ between dolfinx 0.9, 0.10 and 0.11; no other module depends on a version."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from dolfinx import fem, mesh
 from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
+from dolfinx.fem.forms import form_cpp_class, get_integration_domains
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -14,6 +17,62 @@ _Reason = PETSc.SNES.ConvergedReason
 NOT_A_NUMBER = (  # renamed by PETSc 3.25
     _Reason.DIVERGED_FNORM_NAN if hasattr(_Reason, "DIVERGED_FNORM_NAN") else _Reason.DIVERGED_FUNCTION_NANORINF
 )
+
+
+Field = TypeVar("Field")
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A compiled form without mesh, fields and numbers."""
+
+    ufcx: Any
+    module: Any
+    code: str | None
+
+    def in_order(self, fields: Sequence[Field]) -> list[Field]:
+        """Those of a form that its kernels take, in their order."""
+        places = self.ufcx.original_coefficient_positions
+        return [fields[places[i]] for i in range(self.ufcx.num_coefficients)]
+
+    def marked(self, kind: Any) -> list[int]:
+        """The marks of the parts of the mesh that integrals of a kind are over; those over all of it have none."""
+        first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
+        return [mark for i in range(first, last) if (mark := self.ufcx.form_integral_ids[i]) != -1]
+
+
+def kernels_of(form: fem.Form) -> Kernels:
+    """What a form is made of."""
+    return Kernels(form.ufcx_form, form.module, form.code)
+
+
+def bound(
+    kernels: Kernels,
+    spaces: Sequence[fem.FunctionSpace],
+    fields: Sequence[fem.Function],
+    numbers: Sequence[fem.Constant],
+    marks: Mapping[str, mesh.MeshTags | None],
+    domain: Any,
+) -> fem.Form:
+    """A compiled form on a mesh, as `fem.form` makes it.
+
+    Parameters
+    ----------
+    marks
+        By the kind of integral, such as "exterior_facet".
+    domain
+        The mesh in C++.
+    """
+    kinds = {getattr(fem.IntegralType, name): tags for name, tags in marks.items()}
+    parts = {kind: get_integration_domains(kind, tags, kernels.marked(kind)) for kind, tags in kinds.items()}
+    address = int(kernels.module.ffi.cast("uintptr_t", kernels.module.ffi.addressof(kernels.ufcx)))
+    objects = ([each._cpp_object for each in of] for of in (spaces, fields, numbers))
+    make, given = form_cpp_class(np.float64), (*objects, parts)
+    try:
+        made = make(address, *given, {}, domain)
+    except TypeError:
+        made = make([address], *given, [], domain)  # of cells of several kinds, from dolfinx 0.10
+    return fem.Form(made, kernels.ufcx, kernels.code, kernels.module)
 
 
 def shared_facets() -> Any:

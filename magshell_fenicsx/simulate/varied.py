@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.augmented import NoSystem
+from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -22,6 +23,8 @@ from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.waves import Waves
 from magshell_fenicsx.simulate.numbers import on_mesh_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -36,6 +39,8 @@ STEP = 1e-4  # of the range: of differences by p
 ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
 SAME = 1e-10  # relative differences of forces that are rounding
 KEPT = 8  # scenes
+WAVES = "m = "
+SOLVES = 4  # inverse iterations for waves that are nearly neutral
 
 
 class NoInstability(CaseError):
@@ -76,7 +81,7 @@ def refuse_excluded(mode: str) -> None:
     Excluded
         If it has not.
     """
-    if mode.startswith("m = ") or mode == "antisymmetric":
+    if mode.startswith(WAVES) or mode == "antisymmetric":
         raise Excluded(f"the instability is one that the model excludes ({mode}): take symmetry: none")
 
 
@@ -98,6 +103,8 @@ class Varied:
         Of the instability, and the amplitude in which it is.
     mode
         As of the record.
+    m
+        Number of waves around a meridian; 0: the mode is one of the model itself.
     alone
         Whether only amplitudes depend on the number.
 
@@ -110,6 +117,7 @@ class Varied:
     def __init__(self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]) -> None:
         self.kind: Literal["fold", "bifurcation"] = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
+        self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
         self._again, self._ends, self._record = again, ends, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}
@@ -119,6 +127,7 @@ class Varied:
         self._aside = self._value_aside(value)
         base = self._origin if self._origin is not scene else self._scene(value)
         self._first = replace(record, point=replace(record.point, state=self._state_in(base, value)))
+        self._record_value = value
         self._stages[value] = self._base = stage_at(base, self._first)
         self.alone = self._by_amplitudes_alone(value)
         self._line = self._affine(value, self._aside) if self.alone else None
@@ -150,7 +159,8 @@ class Varied:
 
     def _refuse_unknown(self, scene: Scene) -> None:
         record, programme = self._record, scene.problem.programme
-        refuse_excluded(record.mode)
+        if not (self.m and scene.model.axisymmetric):
+            refuse_excluded(record.mode)
         earlier = programme[: record.step - 1]
         step = programme[record.step - 1]
         if earlier and any(how != "load" for how in step.load.hold.values()):
@@ -169,18 +179,54 @@ class Varied:
             If there is no eigenvector.
         """
         state = self._base.enter(self._first.point.state)
+        if self.m:
+            return state, self.null_vector(self._record_value, state, self.m)
         try:
             return state, critical_mode(self._base.newton, state).vector
         except NoEigenpair as e:
             raise CaseError(f"the instability has no null vector: {e}") from None
 
+    def null_vector(self, p: float, state: State, m: int) -> Vector:
+        """That of m waves at a state where these are neutral, nearly."""
+        factors = self.factored(p, state, m)
+        v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
+        for _ in range(SOLVES):
+            v = factors.solve(v)
+            v /= np.linalg.norm(v)
+        return v
+
+    def factored(self, p: float, state: State, m: int) -> Factorisation:
+        """See `continuation.excluded`."""
+        stage = self._at(p)
+        return _waves(stage).factor_at(stage.leave(state), m)
+
+    def along(self, p: float, state: State, m: int, v: Vector) -> float:
+        """See `continuation.excluded`."""
+        return float(v @ self._times(self._at(p), state, m, v))
+
+    def counts(self, p: float, state: State) -> list[int]:
+        """See `continuation.excluded`."""
+        stage = self._at(p)
+        return _waves(stage).counts(stage.leave(state))
+
+    def _times(self, stage: Stage, state: State, m: int, v: Vector) -> Vector:
+        """The tangent of m waves times v."""
+        K = _waves(stage).tangent(stage.leave(state), m)
+        x, y = K.createVecs()
+        x.setArray(v)
+        K.mult(x, y)
+        return np.array(y.array_r)
+
     def at(self, p: float) -> BorderedNewton:
         """The solver at a value."""
-        return self._base.newton if self.alone else self._stage(p).newton
+        return self._at(p).newton
+
+    def _at(self, p: float) -> Stage:
+        return self._base if self.alone else self._stage(p)
 
     def amplitudes(self, p: float) -> dict[str, float]:
         """The amplitudes beside that of the instability."""
-        return self._fixed(self._base if self.alone else self._stage(p), p)
+        return self._fixed(self._at(p), p)
 
     @property
     def costly(self) -> bool:
@@ -285,7 +331,8 @@ class Varied:
 
         def forces(stage: Stage, p: float) -> Vector:
             system, mu = stage.newton.system, {**self._fixed(stage, p), **own}
-            along = times_tangent(system, State(state.u, mu), phi)
+            here = State(state.u, mu)
+            along = self._times(stage, here, self.m, phi) if self.m else times_tangent(system, here, phi)
             return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
 
         self._stages[other] = stage = self._stage(other)
@@ -298,6 +345,12 @@ class Varied:
     def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
         mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
         return {name: v for name, v in mu.items() if name != self.name}
+
+
+def _waves(stage: Stage) -> Waves:
+    model = stage.scene.model
+    assert isinstance(model, MeridianModel)
+    return model.waves
 
 
 def moved(scene: Scene, new: Problem) -> Problem:

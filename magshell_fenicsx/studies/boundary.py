@@ -1,31 +1,28 @@
 """The boundary of stability of a case: its instability followed in a second key, with cusps, as table and picture."""
 
-import base64
 import copy
 import hashlib
 import json
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from pydantic import TypeAdapter
 
-from magshell_fenicsx.continuation.augmented import Locus, NoSystem, Way
+from magshell_fenicsx.continuation.augmented import Locus, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
@@ -37,22 +34,23 @@ from magshell_fenicsx.simulate.numbers import BESIDE
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
+from magshell_fenicsx.simulate.varied import WAVES, Varied, instability
+from magshell_fenicsx.studies.boundary_journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
-from magshell_fenicsx.studies.boundary_start import WAVES, Start, larger, same, start_from
+from magshell_fenicsx.studies.boundary_start import Start, start_from
 from magshell_fenicsx.studies.points import value_at
-from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
+from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, rest_said
 
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
-ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
-SPECIAL = ("cusp", "turn", "meeting")
+SPECIAL = ("cusp", "turn", "meeting", "crossing")
 SAID = {
     "cusp": "a cusp, where two folds are born",
     "turn": "the boundary turns: two instabilities meet there",
     "meeting": "a second mode is neutral",
+    "crossing": "two bifurcations cross",
 }
 
 
@@ -184,20 +182,16 @@ def boundary(
     once: Say = say if comm.rank == 0 else lambda line: None
     with FOLDER.held(folder, comm, name), heard(comm, once) as once:
         say = once if comm.rank == 0 else say
-        journal = partial(_Journal, folder / "points", _identity(source, span, made, begun_at.text))
+        journal = partial(Journal, folder / "points", _identity(source, span, made, begun_at.text))
         value = _value(source, span, made, outside=not start)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
-        if begin["mode"] == "antisymmetric" or begin["mode"].startswith(WAVES):
-            mode, setting, what = begin["mode"], *larger(source, begin["mode"], made)
-            once(f"the instability is {mode}: {what} is modelled")
-            override(source, setting)
-            again, of_mode = begun_at.anywhere(), begin
+        if begin["mode"] == "antisymmetric":
+            once("the instability is antisymmetric: the whole shell is modelled")
+            override(source, "symmetry=none")
+            again = begun_at.anywhere()
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
-            if begin["label"] and mode.startswith(WAVES) and setting != "symmetry=none":
-                begin = same(of_mode, begin)
         if not begin["label"]:
             instability([])
-        refuse_excluded(begin["mode"])
         once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
@@ -258,63 +252,8 @@ def _identity(source: Source, span: Range, made: Made, start: str) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class _Journal:
-    """The results of the solves of a part of the boundary, a file each, and of the whole part.
-
-    `recorded` replays what these sources have kept of an interrupted one.
-    """
-
-    def __init__(self, folder: Path, identity: str, part: str) -> None:
-        self._folder, self._name, self._count = folder, f"{identity}-{part}", 0
-
-    @property
-    def outcome(self) -> dict[str, Any]:
-        """What the part has found; empty until it is finished."""
-        return self._kept(self._name) or {}
-
-    def finish(self, outcome: dict[str, Any]) -> None:
-        """Keep the whole part in place of its solves."""
-        keep(self._folder / f"{self._name}.json", {"sources": code_version(), "outcome": outcome})
-        for file in self._folder.glob(f"{self._name}-*.json"):
-            file.unlink(missing_ok=True)
-
-    def recorded(self, solve: Callable[[], Locus | str]) -> Locus | str:
-        """The result of a solve, or that of an interrupted boundary at this place."""
-        name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
-        if (saved := self._kept(name)) is not None:
-            return _locus(saved) if "state" in saved else str(saved["reason"])
-        solved = solve()
-        content = {"reason": solved} if isinstance(solved, str) else _as_data(solved)
-        keep(self._folder / f"{name}.json", {"sources": code_version(), "outcome": content})
-        return solved
-
-    def _kept(self, name: str) -> dict[str, Any] | None:
-        return kept(self._folder / f"{name}.json", ANY, "outcome", sources=code_version())
-
-
-def _text(v: Vector) -> str:
-    return base64.b64encode(np.ascontiguousarray(v).tobytes()).decode()
-
-
-def _vector(text: str) -> Vector:
-    return np.frombuffer(base64.b64decode(text)).copy()
-
-
-def _as_data(locus: Locus) -> dict[str, Any]:
-    data = {each.name: getattr(locus, each.name) for each in fields(locus)}
-    state = {"u": _text(locus.state.u), "mu": locus.state.mu}
-    way = {"du": _text(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
-    return data | {"state": state, "way": way, "phi": _text(locus.phi)}
-
-
-def _locus(data: dict[str, Any]) -> Locus:
-    state = State(_vector(data["state"]["u"]), data["state"]["mu"])
-    way = Way(_vector(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
-    return Locus(**{**data, "state": state, "way": way, "phi": _vector(data["phi"])})
-
-
 def _begin(
-    source: Source, span: Range, value: float, made: Made, journal: _Journal, say: Say, start: Start
+    source: Source, span: Range, value: float, made: Made, journal: Journal, say: Say, start: Start
 ) -> dict[str, Any]:
     """The run to the instability, as data; without a label there is none."""
     for end in span.ends:
@@ -342,11 +281,10 @@ def _begin(
     outcome = {
         "label": located.label,
         "mode": located.mode,
-        "waves": "",
         "amplitude": located.amplitude,
         "step": located.step,
         "value": state.mu[located.amplitude],
-        "u": _text(state.u),
+        "u": text_of(state.u),
         "mu": state.mu,
         "factorisations": scene.newton.factorisation.count,
     }
@@ -355,25 +293,23 @@ def _begin(
 
 
 def _followed(
-    source: Source, span: Range, value: float, sense: int, made: Made, begin: dict[str, Any], own: _Journal, say: Say
+    source: Source, span: Range, value: float, sense: int, made: Made, begin: dict[str, Any], own: Journal, say: Say
 ) -> dict[str, Any]:
     """One direction of the boundary: its rows from the start, and why it stopped if it did."""
     scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
-    u = _vector(begin["u"])
+    u = vector_of(begin["u"])
     point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
         varied = Varied(scene, record, partial(_problem, source, span, made), value, span.ends)
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
-    varied.mode = varied.mode or begin["waves"]
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
-    curve = Boundary(varied, varied.name, varied.kind, scales, own.recorded)
     rows: list[dict[str, Any]] = []
     begun, end = time.perf_counter(), span.ends[sense > 0]
 
-    def take(label: Label, locus: Locus) -> None:
-        row = _row(varied, label, locus)
+    def take(label: Label, locus: Locus, m: int) -> None:
+        row = _row(varied, label, locus, m)
         rows.append(row)
         part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
@@ -381,11 +317,32 @@ def _followed(
         at = f"{row['key']:.9g} {span.unit}".rstrip()
         say(f"{span.key} = {at}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
 
+    def curve(m: int) -> Boundary:
+        return Boundary(varied, varied.name, varied.kind, scales, own.recorded, m)
+
+    def take_all(curve: Boundary, start: Locus, way: float) -> Locus | None:
+        """The points of a mode; where another one becomes critical before it, the point with the way there."""
+        last = start
+        for label, locus in curve.followed(start, way, span.ends, span.steps):
+            if last is start and label == "crossing" and locus.met == start.met:  # where it has begun
+                continue
+            take(label, locus, curve.m)
+            if label == "crossing" and not last.unstable:
+                return replace(locus, way=last.way)
+            last = locus
+        return None
+
     try:
-        start = curve.start(value, *varied.start())
-        rows.append(_row(varied, "start", start))
-        for label, locus in curve.followed(start, sense, span.ends, span.steps):
-            take(label, locus)
+        mode = curve(varied.m)
+        start = mode.start(value, *varied.start())
+        rows.append(_row(varied, "start", start, mode.m))
+        crossing = take_all(mode, start, sense)
+        while crossing:
+            before, mode = mode.m, curve(crossing.met)
+            critical = varied.null_vector(crossing.p, crossing.state, mode.m)
+            there = mode.start(crossing.p, crossing.state, critical)
+            there = replace(there, met=before, unstable=there.unstable - there.counts[before])
+            crossing = take_all(mode, there, crossing.way.dp)
     except BoundaryLost as e:
         if not rows:
             raise Stopped(str(e)) from None
@@ -393,18 +350,19 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": varied.alone}
 
 
-def _row(varied: Varied, label: Label, locus: Locus) -> dict[str, Any]:
+def _row(varied: Varied, label: Label, locus: Locus, m: int) -> dict[str, Any]:
     load = locus.state.mu[varied.name]
     column = amplitude(varied.name).column
     sizes = sizes_in_units(varied.problem(locus.p))
     measured = sizes.values({column: load})
+    waves = sorted({m, locus.met}) if label == "crossing" else [m]
     return {
         "key": float(locus.p),
         "load": float(load),
         "kind": label if label in SPECIAL else varied.kind,
-        "mode": varied.mode,
+        "mode": ", ".join(f"{WAVES}{each}" for each in waves) if m else varied.mode,
         "error": float(locus.load_error),
-        "unstable": int(locus.unstable),
+        "unstable": int(locus.unstable - (locus.counts[locus.met] if label == "crossing" else 0)),
         "factorisations": int(locus.factorisations),
         **{name: float(number) for name, number in measured.items()},
     }
@@ -418,7 +376,9 @@ def _put_together(
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
     said = [
-        f"{span.key} = {row['key']:.9g} {span.unit}".rstrip() + f", load {row['load']:.9g}: {SAID[row['kind']]}"
+        f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
+        + f", load {row['load']:.9g}: {SAID[row['kind']]}"
+        + (f", {row['mode']}" if row["kind"] == "crossing" else "")
         for row in special
     ]
     content = {
@@ -430,7 +390,7 @@ def _put_together(
         "to": span.last,
         "load": begin["amplitude"],
         "kind": begin["label"],
-        "mode": begin["mode"] or begin["waves"],
+        "mode": begin["mode"],
         "points": len(rows),
         "special": special,
         "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],

@@ -11,9 +11,15 @@ from magshell_fenicsx.output.pictures.lines import smooth
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.naming import key_label
 
-MARKS = {"cusp": "o", "turn": "s", "meeting": "D"}
-WORDS = {"cusp": "cusp", "turn": "turning point", "meeting": "second mode neutral"}
+MARKS = {"cusp": "o", "turn": "s", "meeting": "D", "crossing": "X"}
+WORDS = {
+    "cusp": "cusp",
+    "turn": "turning point",
+    "meeting": "second mode neutral",
+    "crossing": "two bifurcations cross",
+}
 LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+NARROW = 0.25  # of the width of the picture: a region that has no place for more than its mode
 Row = Mapping[str, Any]
 
 
@@ -31,9 +37,14 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     import matplotlib.pyplot as plt
 
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for unstable, group in groupby(pairwise(rows), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])):
-        part = [*group]
-        _line(plot, [part[0][0], *(two for _, two in part)], color="C0", linestyle="--" if unstable else "-")
+    parts = [part for _, part in _by_mode(rows)]
+    for smooth_part in parts:  # with a corner where two bifurcations cross
+        pairs = groupby(pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"]))
+        for unstable, group in pairs:
+            joined = [*group]
+            line = [joined[0][0], *(two for _, two in joined)]
+            _line(plot, line, color="C0", linestyle="--" if unstable else "-")
+    plot.margins(y=0.2 if len(parts) > 1 else None)
     _marks(plot, "load", rows)
     for x, y, words in _regions(rows, content, plot.get_ylim()):
         plot.annotate(words, (x, y), ha="center", va="center", color="0.35")
@@ -141,7 +152,20 @@ def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[fl
 
 
 def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
-    """Places and names of the regions."""
+    """Places and names of the regions; beyond a boundary of several modes each has its own."""
+    parts, whole = _by_mode(rows), _beside(rows, content, limits)
+    if len(parts) < 2:
+        return whole
+    extent, named = np.ptp([row["key"] for row in rows]), [each for each in whole if each[2] == "stable"]
+    for mode, part in parts:
+        for x, y, words in _beside(part, {**content, "mode": mode}, limits)[:1]:
+            narrow = np.ptp([row["key"] for row in part]) < NARROW * extent
+            named.append((x, y, mode if narrow else words))
+    return named
+
+
+def _beside(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
+    """The same of a boundary with one mode."""
     lost = "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
     crossed = sorted(
@@ -161,6 +185,14 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
         if content["kind"] != "fold":
             named[0] = (x, (last + outer) / 2, "stable")
     return named
+
+
+def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """The modes one after the other, each with its rows and the crossings at their ends."""
+    ends = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
+    parts = ([*rows[a : b + 1]] for a, b in pairwise([0, *ends, len(rows) - 1]))
+    named = ((next((row["mode"] for row in part if row["kind"] != "crossing"), None), part) for part in parts)
+    return [(mode, part) for mode, part in named if mode is not None]
 
 
 def _mode(mode: str) -> str:

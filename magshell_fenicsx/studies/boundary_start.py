@@ -1,6 +1,5 @@
-"""Where a boundary starts: at the end of its case, at a located point of another run of it, or in a larger model."""
+"""Where a boundary starts: at the end of its case, or at a located point of another run of it."""
 
-import copy
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,17 +7,14 @@ from math import isclose
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.input.source import CaseError, Source, override
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import case_in
 from magshell_fenicsx.output.store.table import LOCATED, read_rows
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.varied import NoInstability, instability
-from magshell_fenicsx.studies.runner import Made
 
-WAVES = "m = "
-ALIKE = 1e-2  # of the load: an instability of two models
 SAME = 1e-3  # of a load: the run and its repetition, on another processor
 FORM = "write it as DIR:POINT, with the folder of a run and the number of a fold or bifurcation in its path.csv"
 
@@ -98,35 +94,3 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
     row = located[point]
     load = float(row[amplitude(row["amplitude"]).column])
     return Start(text, point, load), replace(source, data=data, places={})
-
-
-def larger(source: Source, mode: str, made: Made) -> tuple[str, str]:
-    """The setting of the smallest model that has a mode, and what it is: of m waves a sector if the case has one."""
-    if mode.startswith(WAVES):
-        m = int(mode.removeprefix(WAVES))
-        sector, setting = copy.deepcopy(source), f"symmetry={m}"
-        override(sector, setting)
-        try:
-            made(sector).problem()
-        except CaseError:
-            pass
-        else:
-            return setting, f"the sector of {180 / m:.4g} degrees between two mirror planes"
-    return "symmetry=none", "the whole shell"
-
-
-def same(of_meridian: dict[str, Any], of_sector: dict[str, Any]) -> dict[str, Any]:
-    """The instability of a sector, if it is the waves of the meridian.
-
-    Raises
-    ------
-    CaseError
-        If it is another one.
-    """
-    one, two = of_meridian["value"], of_sector["value"]
-    if of_sector["label"] != "bifurcation" or abs(two - one) > ALIKE * abs(one):
-        raise CaseError(
-            f"the sector first loses its stability at {two:.6g}, where the meridian has {of_meridian['mode']} at "
-            f"{one:.6g}: take a finer mesh, or symmetry: none"
-        )
-    return of_sector | {"mode": "", "waves": of_meridian["mode"]}

@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from continuation.toys import Toy
+from mpi4py import MPI
+from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.augmented import Kind, Locus
 from magshell_fenicsx.continuation.boundary import Boundary, Label
+from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 
@@ -67,7 +70,7 @@ def followed(
 def test_folds_through_a_cusp(costly: bool) -> None:
     """Folds at a^2 = (e^2 - 1)/3, born at e = 1, where the load is 2; no antisymmetric mode below e^2 = 5.5.
 
-    Where each p costs a system, a point far from the cusp takes two of them.
+    Where each p costs a system, a point far from the cusp takes one of them, but for the first ones.
     """
     toys = OfToys(arch, costly)
     found = followed("fold", 2.2, np.sqrt((2.2**2 - 1) / 3), [1.0, 0.0], (0.5, 2.3), toys)
@@ -83,7 +86,7 @@ def test_folds_through_a_cusp(costly: bool) -> None:
     assert found[-1][1].state.u[0] > 2.3  # the lower fold
     assert sum(locus.factorisations for _, locus in found) < 4 * len(found)
     if costly:
-        assert sum(p > 1.5 for p in toys.made) < 2.6 * sum(locus.p > 1.5 for _, locus in found)
+        assert sum(p > 1.5 for p in toys.made) < 1.4 * sum(locus.p > 1.5 for _, locus in found) + 3
 
 
 def test_a_fold_meets_a_bifurcation() -> None:
@@ -105,3 +108,48 @@ def test_bifurcations_turn() -> None:
     (turn,) = (locus for label, locus in found if label == "turn")
     assert turn.p == pytest.approx(2.0, abs=1e-7)
     assert not [label for label, _ in found if label == "cusp"]
+
+
+@dataclass
+class WithoutModes(OfToys):
+    """The arch's first sine alone. It excludes the second one and another, neutral at thrusts of 4 and 2 e - 1.6."""
+
+    def factored(self, p: float, state: State, m: int) -> Factorisation:
+        matrix = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
+        matrix.setValue(0, 0, self.along(p, state, m, np.ones(1)))
+        matrix.assemble()
+        factors = Factorisation(MPI.COMM_SELF)
+        factors.factor(matrix)
+        return factors
+
+    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+        return float(8 * (neutral(m, p) - p**2 + (p - state.u[0]) ** 2) * v @ v)
+
+    def counts(self, p: float, state: State) -> list[int]:
+        return [int(self.along(p, state, m, np.ones(1)) < 0) for m in (1, 2)]
+
+
+def neutral(m: int, rise: float) -> float:
+    return 4.0 if m == 1 else 2 * rise - 1.6
+
+
+@pytest.mark.parametrize("costly", [False, True])
+@pytest.mark.parametrize(("m", "rise", "way"), [(1, 3.2, -1.0), (2, 2.45, 1.0)])
+def test_two_families_of_excluded_modes_cross(costly: bool, m: int, rise: float, way: float) -> None:
+    """At a rise of 2.8; on its way each is the first one, up to there."""
+
+    def first(rise: float) -> Toy:
+        gradient, hessian = arch(rise).gradient, arch(rise).hessian
+        return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+
+    a = np.sqrt(rise**2 - neutral(m, rise))
+    boundary = Boundary(WithoutModes(first, costly), "load", "bifurcation", (10.0, 1.0), m=m)
+    start = boundary.start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1))
+    found = [*boundary.followed(start, way, (2.42, 3.3), 20)]
+    for label, locus in found:
+        a = np.sqrt(locus.p**2 - neutral(m, locus.p))
+        assert locus.state.mu["load"] == pytest.approx(load_of(a, locus.p), rel=1e-7)
+        assert label == "crossing" or bool(locus.unstable) == (way * (locus.p - 2.8) > 0)
+    (crossing,) = (locus for label, locus in found if label == "crossing")
+    assert (crossing.met, crossing.p) == (3 - m, pytest.approx(2.8, abs=1e-8))
+    assert found[-1][0] == "end"

@@ -12,7 +12,9 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.studies.boundary_picture import draw_map
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.varied import moved
+from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
 
 ARCH = CASES / "arch_boundary.yaml"
 KEY = "loading.0.factor"
@@ -285,17 +287,40 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_waves_of_a_meridian_in_their_sector(tmp_path: Path) -> None:
-    """Three waves of a clamped cap over Poisson's ratio: at both ends of the range as the meridian has them, 1e-3."""
-    case, key = tmp_path / "cap.yaml", "shell.poisson_ratio"
+def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
+    """Of a clamped cap over its depth: 3, then 4. Runs on both sides have these loads, one at the crossing both."""
+    case, key = tmp_path / "cap.yaml", "shell.polar"
     case.write_text(
-        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 22, poisson_ratio: 0.3}\n"
-        "boundary: {rim: clamped}\nmesh: {refinement: 1}\nloading: {kind: pressure, until: limit}\n"
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 24.5, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\nloading: {kind: pressure, until: limit}\n"
     )
-    found = ms.boundary(case, f"{key}=0.3:0.35:1", out=tmp_path / "b")
-    assert (found.content["kind"], found.content["mode"]) == ("bifurcation", "m = 3")
-    assert {row["mode"] for row in found.rows} == {"m = 3"}
-    for row in (found.rows[0], found.rows[-1]):
-        records = ms.follow(ms.Scene(ms.Case.load(case, [f"{key}={row['key']}"])))
-        waves = next(r for r in records if r.mode == "m = 3")
-        assert row["load"] == pytest.approx(waves.point.state.mu["pressure"], rel=1e-3)
+
+    def run(depth: float) -> dict[str, float]:
+        """The loads of all waves, in their order, on the mesh of the boundary: that of the case, stretched."""
+        start = ms.Scene(ms.Case.load(case))
+        scene = Scene(moved(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()), start.comm)
+        return {r.mode: r.point.state.mu["pressure"] for r in ms.follow(scene) if r.mode.startswith("m = ")}
+
+    done = magshell("boundary", case, "--over", f"{key}=24:26:2", "--out", tmp_path / "b")
+    assert done.returncode == 0, done.stderr
+    assert "two bifurcations cross, m = 3, m = 4" in done.stdout
+    rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
+    modes = [row["mode"] for row in rows]
+    at = modes.index("m = 3, m = 4")
+    assert rows[at]["kind"] == "crossing"
+    assert {*modes[:at]} == {"m = 3"}
+    assert {*modes[at + 1 :]} == {"m = 4"}
+    for row in (rows[0], rows[-1]):
+        loads = run(float(row["key"]))
+        assert next(iter(loads)) == row["mode"]
+        assert float(row["load"]) == pytest.approx(loads[row["mode"]], rel=1e-7)
+    loads = run(float(rows[at]["key"]))
+    assert [loads["m = 3"], loads["m = 4"]] == pytest.approx([float(rows[at]["load"])] * 2, rel=1e-6)
+    content = json.loads((tmp_path / "b" / "boundary.json").read_text())
+    named = {words for _, _, words in _regions(_numbers(rows), content, (0.0, 1.0))}
+    assert named == {"stable", "buckles with m = 3", "buckles with m = 4"}
+    assert (tmp_path / "b" / "boundary.png").stat().st_size > 10_000
+
+
+def _numbers(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
+    return [{**row, "key": float(row["key"]), "load": float(row["load"])} for row in rows]

@@ -1,0 +1,72 @@
+"""What a boundary keeps of its solves, so that an interrupted one goes on."""
+
+import base64
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.continuation.augmented import Locus, Way
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.studies.runner import keep, kept
+
+ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+
+
+class Journal:
+    """The results of the solves of a part of the boundary, a file each, and of the whole part.
+
+    `recorded` replays what these sources have kept of an interrupted one.
+    """
+
+    def __init__(self, folder: Path, identity: str, part: str) -> None:
+        self._folder, self._name, self._count = folder, f"{identity}-{part}", 0
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """What the part has found; empty until it is finished."""
+        return self._kept(self._name) or {}
+
+    def finish(self, outcome: dict[str, Any]) -> None:
+        """Keep the whole part in place of its solves."""
+        keep(self._folder / f"{self._name}.json", {"sources": code_version(), "outcome": outcome})
+        for file in self._folder.glob(f"{self._name}-*.json"):
+            file.unlink(missing_ok=True)
+
+    def recorded(self, solve: Callable[[], Locus | str]) -> Locus | str:
+        """The result of a solve, or that of an interrupted boundary at this place."""
+        name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
+        if (saved := self._kept(name)) is not None:
+            return _locus(saved) if "state" in saved else str(saved["reason"])
+        solved = solve()
+        content = {"reason": solved} if isinstance(solved, str) else _as_data(solved)
+        keep(self._folder / f"{name}.json", {"sources": code_version(), "outcome": content})
+        return solved
+
+    def _kept(self, name: str) -> dict[str, Any] | None:
+        return kept(self._folder / f"{name}.json", ANY, "outcome", sources=code_version())
+
+
+def text_of(v: Vector) -> str:
+    return base64.b64encode(np.ascontiguousarray(v).tobytes()).decode()
+
+
+def vector_of(text: str) -> Vector:
+    return np.frombuffer(base64.b64decode(text)).copy()
+
+
+def _as_data(locus: Locus) -> dict[str, Any]:
+    data = {each.name: getattr(locus, each.name) for each in fields(locus)}
+    state = {"u": text_of(locus.state.u), "mu": locus.state.mu}
+    way = {"du": text_of(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
+    return data | {"state": state, "way": way, "phi": text_of(locus.phi)}
+
+
+def _locus(data: dict[str, Any]) -> Locus:
+    state = State(vector_of(data["state"]["u"]), data["state"]["mu"])
+    way = Way(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
+    return Locus(**{**data, "state": state, "way": way, "phi": vector_of(data["phi"])})

@@ -1,0 +1,59 @@
+"""Forms that scenes share: compiled once, bound to the mesh, the fields and the numbers of each."""
+
+from typing import Any
+
+import dolfinx.jit
+import numpy as np
+import pytest
+from dolfinx import fem
+
+from magshell_fenicsx.assembly import kernels
+from magshell_fenicsx.continuation.system import Skewed, State
+from magshell_fenicsx.public import problem_of
+from magshell_fenicsx.simulate.scene import Scene
+
+CAP = {
+    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.01, "polar": 12.0, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "symmetry": "axisymmetric",
+    "loading": {"kind": "pressure", "until": "limit"},
+}
+RING = CAP | {  # a pressure without potential, and its skew tangent
+    "shell": {"geometry": "cylinder", "radius": 1.0, "length": 0.8, "thickness": 0.02, "poisson_ratio": 0.2},
+    "boundary": {"bottom": "clamped"},
+}
+
+
+def _evaluated(case: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
+    scene = Scene(problem_of(case))
+    system, start = scene.model.system, scene.unloaded()
+    u = system.held(1e-3 * np.sin(np.arange(system.size)))
+    state = State(u, start.mu | {"pressure": 0.3})
+    tangent = system.tangent(state.u, state.mu)
+    products = list[np.ndarray[Any, Any]]()
+    for part in (tangent.K, tangent.N) if isinstance(tangent, Skewed) else (tangent,):
+        x, y = part.createVecs()
+        x.setArray(u)
+        part.mult(x, y)
+        products.append(np.array(y.array))
+    volume = fem.assemble_scalar(scene.model._volume)
+    energies = [*system.energies(u, state.mu).values(), volume]
+    return [system.residual(state.u, state.mu), np.concatenate(products), np.array(energies)]
+
+
+@pytest.mark.parametrize("case", [CAP, RING])
+def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its residual, tangent and energies are, to the last bit, those of forms that are compiled for it alone."""
+    other = case | {"shell": case["shell"] | {"poisson_ratio": 0.37, "thickness": 0.013}}
+    monkeypatch.setattr(kernels, "_known", {})
+    alone = _evaluated(other)
+    monkeypatch.setattr(kernels, "_known", {})
+    first = _evaluated(case)
+
+    def refused(*given: Any, **options: Any) -> None:
+        raise AssertionError("a form is compiled again")
+
+    monkeypatch.setattr(dolfinx.jit, "ffcx_jit", refused)
+    again = _evaluated(other)
+    assert all(np.array_equal(one, two) for one, two in zip(alone, again, strict=True))
+    assert not np.allclose(alone[-1], first[-1], rtol=1e-2, atol=0)
