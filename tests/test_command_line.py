@@ -103,7 +103,7 @@ cli.main()
 
 @pytest.mark.parametrize("words", [["-m", "magshell_fenicsx", "schema"], ["-c", AFTER_PETSC]])
 def test_nobody_reads_what_is_said(words: list[str]) -> None:
-    """As of `| head`: the end of any program, without a report by PETSc of a crash, which it makes from its import on."""
+    """As of `| head`: the end of any program, without a report by PETSc of a crash."""
     with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as said:
         assert said.stdout
         assert said.stderr

@@ -48,7 +48,9 @@ def _described(case: Case, problem: Problem) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / problem.material.h,
     }
-    flat = case.context.shell.geometry in FLAT and not problem.loads.pressure  # p_c is of spheres, and the unit of pressures
+    flat = (
+        case.context.shell.geometry in FLAT and not problem.loads.pressure
+    )  # p_c is of spheres, and the unit of pressures
     if flat:
         del numbers["p_c/E"]
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]

@@ -1,5 +1,7 @@
 """Reports in a real browser: headless Chromium opens them as a reader would, on a screen and on a phone."""
 
+import csv
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.output.pictures.curve import AROUND
 from magshell_fenicsx.output.pictures.lines import FINE, smooth, splined
 from magshell_fenicsx.output.report.interactive import plotly
 from magshell_fenicsx.output.report.report import write_report
@@ -162,6 +165,44 @@ def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
     assert page.value("document.getElementById('step').value") == "1"
     page.value("const s = document.getElementById('slider'); s.value = 0; s.oninput({target: s})")
     assert page.value("document.getElementById('step').value") == "0"
+
+
+def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report: Any, tmp_path: Path) -> None:
+    """Two folds 1 % of the curve apart: an inset around them as in curve.png, and none far apart."""
+    for gap, drawn in ((0.01, True), (0.5, False)):
+        folder = tmp_path / f"{gap}"
+        shutil.copytree(report("time").parent, folder)
+        with (folder / "path.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        middle, load = len(rows) // 2, lambda w: 1 - np.exp(-w)
+        for i, row in enumerate(rows):
+            x = 1.0 * i if i < middle else (1 - gap) * (middle - 1) if i == middle else i + 1.0
+            located = i in (middle - 1, middle)
+            row |= {"amplitude": "force" if i else "", "label": "fold" if located else "step" if i else "start"}
+            row |= {
+                "w_over_h": f"{x}",
+                "w_pole_over_h": f"{x}",
+                "force": f"{load(x)}",
+                "negative_pivots": "0",
+                "step": "1",
+            }
+        with (folder / "path.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0].keys())
+            writer.writeheader()
+            writer.writerows(rows)
+        write_report(folder)
+        page.open(folder / "report.html", 1200)
+        page.wait("document.body.dataset.ready === 'yes'")
+        ranges = page.value("['x', 'y'].map(c => document.getElementById('curve2d')._fullLayout[`${c}axis2`]?.range)")
+        if drawn:
+            low, high = np.array([[w, load(w)] for w in ((1 - gap) * (middle - 1), middle - 1)])
+            around = np.array([low - AROUND * (high - low), high + AROUND * (high - low)])
+            assert np.array(ranges) == pytest.approx(around.T)
+            boxes = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().right)"
+            assert max(page.value(boxes)) <= 1200
+        else:
+            assert ranges == [None, None]
+        assert page.errors == []
 
 
 def test_a_turn_between_points_is_smooth() -> None:

@@ -49,7 +49,7 @@ PICTURES = {  # in the order of the report
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
     "gradients.png": "Where a result would change most: red where more of a field raises it, blue where it lowers it.",
-    "frequencies.png": "Natural frequencies squared along the path; below zero the shell is unstable.",
+    "frequencies.png": "Natural frequencies; below zero the shell is unstable.",
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
 SMALL = ("curve.png", "shell.png")  # beside each other
