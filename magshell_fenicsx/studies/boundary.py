@@ -40,6 +40,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.varied import Varied, instability, refuse_excluded
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.boundary_start import WAVES, Start, larger, same, start_from
+from magshell_fenicsx.studies.naming import load_said
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, keep, kept, rest_said
 
@@ -198,7 +199,7 @@ def boundary(
         if not begin["label"]:
             instability([])
         refuse_excluded(begin["mode"])
-        once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
+        once(f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
         def followed(sense: int) -> Iterator[str]:
@@ -346,6 +347,7 @@ def _begin(
         "amplitude": located.amplitude,
         "step": located.step,
         "value": state.mu[located.amplitude],
+        "row": _load(located.amplitude, state.mu[located.amplitude], scene.problem),
         "u": _text(state.u),
         "mu": state.mu,
         "factorisations": scene.newton.factorisation.count,
@@ -379,7 +381,7 @@ def _followed(
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
         beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
         at = f"{row['key']:.9g} {span.unit}".rstrip()
-        say(f"{span.key} = {at}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
+        say(f"{span.key} = {at}: {row['kind']} at {load_said(row, varied.name)}{beside}{left}")
 
     try:
         start = curve.start(value, *varied.start())
@@ -394,20 +396,21 @@ def _followed(
 
 
 def _row(varied: Varied, label: Label, locus: Locus) -> dict[str, Any]:
-    load = locus.state.mu[varied.name]
-    column = amplitude(varied.name).column
-    sizes = sizes_in_units(varied.problem(locus.p))
-    measured = sizes.values({column: load})
     return {
         "key": float(locus.p),
-        "load": float(load),
+        **_load(varied.name, locus.state.mu[varied.name], varied.problem(locus.p)),
         "kind": label if label in SPECIAL else varied.kind,
         "mode": varied.mode,
         "error": float(locus.load_error),
         "unstable": int(locus.unstable),
         "factorisations": int(locus.factorisations),
-        **{name: float(number) for name, number in measured.items()},
     }
+
+
+def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
+    """A load, and what it is in the case's units if it has any, as columns."""
+    measured = sizes_in_units(problem).values({amplitude(name).column: value})
+    return {"load": float(value), **{column: float(number) for column, number in measured.items()}}
 
 
 def _put_together(
@@ -417,10 +420,9 @@ def _put_together(
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
-    said = [
-        f"{span.key} = {row['key']:.9g} {span.unit}".rstrip() + f", load {row['load']:.9g}: {SAID[row['kind']]}"
-        for row in special
-    ]
+    at = [f"{span.key} = {row['key']:.9g} {span.unit}".rstrip() for row in special]
+    loads = [load_said(row, begin["amplitude"]) for row in special]
+    said = [f"{each}, {load}: {SAID[row['kind']]}" for each, load, row in zip(at, loads, special, strict=True)]
     content = {
         "case": name,
         "settings": list(settings),
