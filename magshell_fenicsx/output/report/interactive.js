@@ -146,7 +146,7 @@
     for (let i = n - 1; i >= 0; i--) out[i] = (right[i] - (i + 1 < n ? up[i] * out[i + 1] : 0)) / middle[i];
     return out;
   };
-  const joined = (x, y, located, times) => {
+  const joined = (x, y, located, times, level = []) => { // level: which coordinate has its extreme at which end, 0 or -1
     const later = times && times.map((t, i) => i === 0 || t > times[i - 1]);
     if (later && later.filter(Boolean).length >= 4 && later.slice(2).every(Boolean)) {
       const skip = later[1] ? 0 : 1, rest = v => v.slice(skip), t = rest(times);
@@ -157,7 +157,9 @@
     if (x.length < 2) return [x, y];
     const span = v => Math.max(...v) - Math.min(...v) || 1, chord = [0];
     for (let i = 1; i < x.length; i++) chord.push(last(chord) + Math.sqrt(Math.max(Math.hypot((x[i] - x[i - 1]) / span(x), (y[i] - y[i - 1]) / span(y)), 1e-12)));
-    return [x, y].map(v => hermite(chord, v, slopesOf(chord, v, located)));
+    const slopes = [x, y].map(v => slopesOf(chord, v, located));
+    for (const [c, end] of level) slopes[c][end < 0 ? x.length - 1 : 0] = 0;
+    return [x, y].map((v, c) => hermite(chord, v, slopes[c]));
   };
 
   const on = name => about.columns[name].values.map(v => about.columns[name].sign * v);
@@ -199,7 +201,8 @@
       const color = palette[n % palette.length];
       for (const l of s.lines) {
         const pick = v => l.rows.map(i => v[i]), is = l.rows;
-        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null);
+        const load = [part("across").value, part("up").value].indexOf(s.load), level = load < 0 ? [] : l.level.map(end => [load, end]);
+        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null, level);
         curves.push(curve);
         for (const [first, end, unstable] of l.pieces) {
           const cut = v => v.slice(first * fine, end * fine + 1), name = (step < 0 ? s.title + ", " : "") + (unstable ? "unstable" : "stable");
