@@ -47,6 +47,7 @@ def pixels(file: Path) -> np.ndarray:
     return np.asarray(Image.open(file).convert("RGB"), dtype=int)
 
 
+@pytest.mark.telling
 def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) -> None:
     """Without summary, as a killed run is: the same files with the same pixels."""
     there = {file.name for file in run.glob("*.png")}

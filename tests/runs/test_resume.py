@@ -115,6 +115,7 @@ def test_killed_at_random_moments(whole: Whole, tmp_path: Path) -> None:
     check_fields(out)
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("whole", ["meridian"], indirect=True)
 def test_torn_files(whole: Whole, tmp_path: Path, no_pictures: None) -> None:
     """Half a row and half an entry, as a crash of the machine leaves them, are cut off."""

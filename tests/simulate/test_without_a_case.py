@@ -83,6 +83,7 @@ def function(dome: Dome, space: tuple[Any, ...], of: Any) -> fem.Function:
     return found
 
 
+@pytest.mark.telling
 def test_numbers_of_the_case_on_the_same_mesh(dome: Dome) -> None:
     case = {
         "shell": {"geometry": "mesh", "file": str(dome[2]), "radius": "25 mm", **MATERIAL},

@@ -211,6 +211,7 @@ def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], sai
         ms.boundary(ARCH, over, settings, tmp_path / "b")
 
 
+@pytest.mark.telling
 def test_through_a_field_of_zero(tmp_path: Path) -> None:
     """Where the case starts; at the ends against the axisymmetric reference of tests/cases/test_cases.py."""
     found = ms.boundary(CASES / "dimple_buckling.yaml", "magnetic.lambda_m=-0.00184:0.00184:3", out=tmp_path / "b")

@@ -76,6 +76,7 @@ def test_excluded_modes(shell: Shells, degree: int) -> None:
     assert difference(modes.system, random_displacement(model, 1e-3), MU) <= 1e-12
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("condition", ["free", "simply supported", "clamped"])
 def test_edge_conditions(condition: Condition) -> None:
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {"rim": condition}, Loads(pressure=True))
