@@ -90,7 +90,7 @@ class Shell:
         self._keys = keys | ({} if radius is None else {"radius": radius})
         geometry = surface if isinstance(surface, str) else "mesh"
         if geometry not in SHAPES:
-            raise CaseError(f"{NAME}: shell.geometry: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
+            raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
         refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._own, *of_mesh))
         if isinstance(surface, str):
@@ -199,7 +199,7 @@ def Step(kind: str, **keys: Any) -> Piece:
         If the kind or a key of it is none of a case.
     """
     if kind not in STEPS:
-        raise CaseError(f"{NAME}: loading.kind: {kind}: {unknown(kind, STEPS, 'kind')}")
+        raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
     refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
     return Piece("loading", lambda shell: shell.plain({"kind": kind, **keys}, "loading"))
 

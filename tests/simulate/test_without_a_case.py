@@ -236,7 +236,7 @@ def cap(*parts: Any, **sections: Any) -> Any:
         (lambda: ms.Shell("cap", thicknes=0.1), "Problem: shell.thicknes: unknown key; did you mean thickness?"),
         (lambda: ms.Shell("strip", widht=0.1), "Problem: shell.widht: unknown key; did you mean width?"),
         (lambda: ms.Shell("hemisfere"), "unknown geometry; did you mean hemisphere?"),
-        (lambda: ms.Step("indentaton"), "unknown kind; did you mean indentation?"),
+        (lambda: ms.Step("indentaton"), "unknown kind of step; did you mean indentation?"),
         (lambda: ms.Pressure(pint=3), "Problem: loading.pint: unknown key; did you mean points?"),
         (lambda: ms.Force("tip", dept=3), "Problem: loading.dept: unknown key; did you mean depth?"),
         (lambda: ms.Section("fundation", stiffness=1), "unknown section; did you mean foundation?"),
