@@ -42,8 +42,8 @@ class Drawn:
 
     Attributes
     ----------
-    case
-        As in summary.json.
+    resolved
+        The case as in summary.json.
 
     Raises
     ------
@@ -55,15 +55,15 @@ class Drawn:
         self.folder = folder
         self.rows = _rows(folder)
         self.on_path = [row for row in self.rows if row["label"] != SOLUTION]
-        self.case = case_in(folder)
-        self.headline = headline(self.case, self.rows)
-        self.style = style_of(self.case, options)
+        self.resolved = case_in(folder)
+        self.headline = headline(self.resolved, self.rows)
+        self.style = style_of(self.resolved, options)
         self._points: dict[int, tuple[Surface, About]] = {}
 
     @property
     def place(self) -> str:
         """What the point of w_pole_over_h is called."""
-        return pole_of(self.case)
+        return pole_of(self.resolved)
 
     @cached_property
     def camera(self) -> Camera:
@@ -194,8 +194,8 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
                 parts = worth_drawing(drawn_parts(run.rows, amplitude))
                 add_shapes(curve, parts, chosen, style, run.camera)
         yield from written(curve, style, "curve")
-        if run.case.get("sensors"):
-            yield from written(readings_figure(run.rows, amplitude, run.case, style), style, "sensors")
+        if run.resolved.get("sensors"):
+            yield from written(readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
