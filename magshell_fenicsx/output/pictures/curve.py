@@ -156,7 +156,7 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
     drawn, at = list[Array](), place_of or (lambda row: place(row, of.amplitude))
     load = None if place_of else of_load(of.amplitude)
     for line in lines_of(of):
-        curve = line.joined(*zip(*map(at, line.rows), strict=True), load)
+        curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
         drawn.append(curve)
         for first, last, unstable in line.pieces:
             piece = curve[:, first * FINE : last * FINE + 1]
@@ -181,7 +181,8 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
 def hidden(axes: "Axes", of: Part) -> Array | None:
     """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can be seen."""
     for line in lines_of(of):
-        curve = line.joined(*zip(*(place(row, of.amplitude) for row in line.rows), strict=True), of_load(of.amplitude))
+        places = [place(row, of.amplitude) for row in line.rows]
+        curve = line.joined(*zip(*places, strict=True), of_load=of_load(of.amplitude))
         for first, last, unstable in line.pieces:
             piece = curve[:, first * FINE : last * FINE + 1]
             size = np.ptp(axes.transData.transform(piece.T), axis=0) * 72 / axes.figure.dpi

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from magshell_fenicsx.output.pictures.curve import draw_lines, legend, worth_drawing
+from magshell_fenicsx.output.pictures.curve import PlaceOf, draw_lines, legend, worth_drawing
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, columns, drawing
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.scales import number_format
@@ -33,6 +33,10 @@ def readings_figure(rows: Sequence[Row], amplitude: str, case: Mapping[str, Any]
     names, part = list(case["sensors"]), worth_drawing(drawn_parts(rows, amplitude))[-1]
     load = shown(registered(part.amplitude).column, part.rows[0])
     size, unit = unit_of(case)
+
+    def over_load(column: str) -> PlaceOf:
+        return lambda row: (load.on_axis(row), size * float(row[column]))
+
     largest = max(abs(float(row[f"{name}_B{axis}"])) for name in names for axis in "xyz" for row in part.rows)
     across = columns(min(len(names), MOST))
     high, wide = -(-min(len(names), MOST) // across), (style.width or (ONE if across == 1 else SEVERAL)) / INCH
@@ -43,7 +47,7 @@ def readings_figure(rows: Sequence[Row], amplitude: str, case: Mapping[str, Any]
             for k, axis in enumerate("xyz"):
                 column = f"{name}_B{axis}"
                 if max(abs(float(row[column])) for row in part.rows) > SILENT * largest:
-                    draw_lines(axes, part, f"C{k}", lambda row, of=column: (load.on_axis(row), size * float(row[of])))
+                    draw_lines(axes, part, f"C{k}", over_load(column))
                     axes.plot([], [], color=f"C{k}", lw=1.2, label=f"$B_{axis}$")
             axes.set(xlabel=load.label, ylabel=f"field at {name.replace('_', ' ')}  {unit}")
             axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
