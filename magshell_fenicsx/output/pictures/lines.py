@@ -119,7 +119,7 @@ class Line:
         """Its ends, 0 and -1, at which its amplitude has an extreme: a fold in that."""
         return [i for i in (0, -1) if (self.rows[i]["label"], self.rows[i]["amplitude"]) == ("fold", self.amplitude)]
 
-    def joined(self, x: Sequence[float], y: Sequence[float], of_load: int | None = None) -> Array:
+    def joined(self, x: Sequence[float], y: Sequence[float], *, of_load: int | None = None) -> Array:
         """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows.
 
         Parameters
