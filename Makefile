@@ -4,6 +4,9 @@ PYTEST := python3 -m pytest -n auto --maxprocesses 4 --dist worksteal  # a worke
 # OPENBLAS_CORETYPE, on the command line or in the environment, must reach OpenBLAS in there
 CORE_TYPE = $(if $(OPENBLAS_CORETYPE),$(ENV) .ci/core-type $(OPENBLAS_CORETYPE))
 
+LIMITED = $(if $(LIMIT),timeout --signal=INT --kill-after=30 $(LIMIT))
+MARK ?= not slow
+
 CAMPAIGN := sh -c 'PYTHONPATH=cases:$$PYTHONPATH exec python3 -m "$$@"' campaign
 
 define HELP
@@ -17,9 +20,9 @@ make bench            error, time and memory of a fixed set into results/bench.j
                       to docs/bench/bench.json: 10 minutes on an idle machine
 make studies          error against run time of two cases into docs/study/: 10 minutes
 make test             lint and all tests; with ROOT=sid the tests that are not marked slow, on Debian unstable
-                      (LIMIT=seconds)
+                      (MARK=telling: those that tell most of another dolfinx, three minutes)
 make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
-                      (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
+                      (both: LIMIT=seconds; OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
 make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
@@ -76,11 +79,11 @@ site:
 
 test: $(if $(ROOT),,lint)
 	$(CORE_TYPE)
-	$(ENV) $(if $(LIMIT),timeout --signal=INT --kill-after=30 $(LIMIT)) $(PYTEST) $(if $(ROOT),-m 'not slow' tests/versions tests)
+	$(ENV) $(LIMITED) $(PYTEST) $(if $(ROOT),-m '$(MARK)' tests/versions tests)
 
 fast: lint
 	$(CORE_TYPE)
-	$(ENV) $(PYTEST) -m 'not slow' $(TESTS)
+	$(ENV) $(LIMITED) $(PYTEST) -m 'not slow' $(TESTS)
 
 lint:
 	$(ENV) ruff check --exclude .env .

@@ -64,9 +64,10 @@ def _shared(source: Any) -> Any:
 def main() -> None:
     """Run the program."""
     open_standard_streams()
+    os.environ["PETSC_OPTIONS"] = f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"  # it would report a crash
     _hand_over_to_petsc(sys.argv)
     gc.set_threshold(300_000, 5, 5)  # a small run looks for no garbage; Python's own would do so two hundred times
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception:

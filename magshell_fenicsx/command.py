@@ -3,7 +3,6 @@
 Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every command.
 """
 
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -164,10 +163,6 @@ def world() -> Any:
 
 def print_line(line: str) -> None:
     if world().rank == 0:
-        with suppress(ValueError):  # elsewhere than in the main thread
-            signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
-            if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-                signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the same under `nohup`
         terminal.print_line(line)
 
 

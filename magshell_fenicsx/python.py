@@ -8,23 +8,32 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import atan2, degrees, hypot
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from dolfinx import fem, mesh
+from pydantic import BaseModel
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.messages import refuse_unknown, unknown
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.given import Home, Part
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.platform.reading import Files
 from magshell_fenicsx.problem import problem
+from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
 MESH = "the mesh"  # the same, of a mesh
+SHAPES: Mapping[str, type[BaseModel]] = {  # geometry -> its section
+    geometry: section
+    for section in (ShellSection, *get_args(Surface))
+    for geometry in get_args(section.model_fields["geometry"].annotation)
+}
 
 
 class Shell:
@@ -54,6 +63,8 @@ class Shell:
     ------
     MeshError
         On every rank, if the mesh is of another kind, or tags are missing.
+    CaseError
+        If a geometry or a key is none that a shell has.
     """
 
     def __init__(
@@ -77,6 +88,11 @@ class Shell:
         self.name, self._own = name, {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
+        geometry = surface if isinstance(surface, str) else "mesh"
+        if geometry not in SHAPES:
+            raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
+        of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
+        refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._own, *of_mesh))
         if isinstance(surface, str):
             given = {"edges": edges, "patches": patches, "facet_tags": facet_tags, "cell_tags": cell_tags, "unit": unit}
             if strange := next((name for name, value in given.items() if value is not None), None):
@@ -158,12 +174,33 @@ def Section(key: str, **keys: Any) -> Piece:
     """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, `Section("natural", ...)`.
 
     One that is a list is a keyword of `Problem`: `joints=[...]`, `contact=[...]`.
+
+    Raises
+    ------
+    CaseError
+        If the section or a key of it is none of a case.
     """
+    if key not in Case.model_fields:
+        raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
+    annotation = Case.model_fields[key].annotation
+    members = [each for each in (annotation, *get_args(annotation)) if isinstance(each, type)]
+    sections = [each for each in members if issubclass(each, BaseModel)]
+    if len(sections) == 1:  # others are lists, and names with sections
+        refuse_unknown(keys, sections[0], f"{NAME}: {key}")
     return Piece(key, lambda shell: shell.plain(keys, key))
 
 
 def Step(kind: str, **keys: Any) -> Piece:
-    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural", "contact", ..."""
+    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural", "contact", ...
+
+    Raises
+    ------
+    CaseError
+        If the kind or a key of it is none of a case.
+    """
+    if kind not in STEPS:
+        raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
+    refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
     return Piece("loading", lambda shell: shell.plain({"kind": kind, **keys}, "loading"))
 
 

@@ -90,10 +90,21 @@ def test_unwritable_out(out: str) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_nobody_reads_what_is_said() -> None:
+AFTER_PETSC = """
+from magshell_fenicsx import cli
+def app(**_):
+    from petsc4py import PETSc
+    from magshell_fenicsx.platform.terminal import print_line
+    print_line("said")
+cli.app = app
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("words", [["-m", "magshell_fenicsx", "schema"], ["-c", AFTER_PETSC]])
+def test_nobody_reads_what_is_said(words: list[str]) -> None:
     """As of `| head`: the end of any program, without a report by PETSc of a crash."""
-    command = [sys.executable, "-m", "magshell_fenicsx", "schema"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as said:
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as said:
         assert said.stdout
         assert said.stderr
         said.stdout.close()
@@ -144,6 +155,8 @@ def test_check_tells_what_is_left_out() -> None:
     assert done.returncode == 0
     assert "magnetic energy: lambda_m is zero" in done.stdout
     assert "R/h = 90" in done.stdout
+    assert "p_c/E = " in done.stdout
+    assert "p_c" not in magshell("check", CASES / "magnetic_strip.yaml").stdout  # of a flat shell without a pressure
 
 
 def test_version() -> None:

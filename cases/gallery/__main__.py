@@ -80,13 +80,16 @@ def thumbnails(names: Sequence[str]) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of motions and snaps the curve, of a bifurcation its mode.
+    """The pictures that show the result best: of sensors their readings, of motions and snaps the curve, of a
+    bifurcation its mode.
 
     Where the branch that begins there is followed, that is the shell. Beside bodies and magnets these are shown.
     """
     if not (folder / "path.csv").exists():
         return []
     rows = read_rows(folder / "path.csv")
+    if (folder / "sensors.png").exists():
+        return ["sensors.png"]
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
     steps = case_in(folder)["loading"]

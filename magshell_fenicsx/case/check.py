@@ -15,6 +15,7 @@ from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.names import open_edges
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.problem.sizes import degree_of
+from magshell_fenicsx.shape.sections import FLAT
 
 
 def describe(case: Case, problem: Problem | None = None) -> str:
@@ -47,8 +48,13 @@ def _described(case: Case, problem: Problem) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / problem.material.h,
     }
+    flat = (
+        case.context.shell.geometry in FLAT and not problem.loads.pressure
+    )  # p_c is of spheres, and the unit of pressures
+    if flat:
+        del numbers["p_c/E"]
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
-    lines += _in_units(case)
+    lines += _in_units(case, without="p_c" if flat else "")
     lines += case.several.told if case.several else []
     lines += [line for part in case.context.abilities for line in part.numbers(case.context)]
     patch = None
@@ -80,12 +86,12 @@ def _described(case: Case, problem: Problem) -> str:
     return "\n".join(lines)
 
 
-def _in_units(case: Case) -> list[str]:
-    """The sizes of a case with units."""
+def _in_units(case: Case, without: str) -> list[str]:
+    """The sizes of a case with units, but for one scale."""
     sizes = sizes_of(case.context)
     named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", sizes.field)}
     factor = {"λ_m": case.lambda_m}
-    shown = {scale: words for scale, words in named.items() if scale in sizes.of}
+    shown = {scale: words for scale, words in named.items() if scale in sizes.of and scale != without}
     return [f"{name} = {sizes.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in shown.items()]
 
 

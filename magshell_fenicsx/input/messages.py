@@ -8,7 +8,7 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from typing import Any, get_args, get_origin
 
@@ -95,10 +95,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"
     if kind == "extra_forbidden":
-        allowed = _allowed_keys(location[:-1], source.data, case)
-        near = difflib.get_close_matches(str(location[-1]), allowed, n=1)
-        hint = f"did you mean {near[0]}? " if near else ""
-        return f"{place}: {key}: unknown key; {hint}allowed here: {', '.join(sorted(allowed))}"
+        return f"{place}: {key}: {unknown(str(location[-1]), _allowed_keys(location[:-1], source.data, case))}"
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
@@ -119,6 +116,32 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     written = _at(source.data, location, str) if isinstance(value, float) else ""
     text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # its limits are those of the number
     return f"{place}: {key}: {text}: {said}{meaning}"
+
+
+def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:
+    """That there is no such key, and which is nearest to it.
+
+    Examples
+    --------
+    >>> unknown("thicknes", ["radius", "thickness"])
+    'unknown key; did you mean thickness? allowed here: radius, thickness'
+    """
+    near = difflib.get_close_matches(key, allowed, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"unknown {what}; {hint}allowed here: {', '.join(sorted(allowed))}"
+
+
+def refuse_unknown(keys: Iterable[str], section: type[BaseModel], place: str, others: Iterable[str] = ()) -> None:
+    """See that keys are those of a section, or others that stand there too.
+
+    Raises
+    ------
+    CaseError
+        With the first that is not, and the nearest one that is.
+    """
+    allowed = {*section.model_fields, *others}
+    if strange := next((key for key in keys if key not in allowed), None):
+        raise CaseError(f"{place}.{strange}: {unknown(strange, allowed)}")
 
 
 def shown(value: Any) -> str:

@@ -75,6 +75,7 @@ class MeshSurface(FileKeys, SurfaceSection):
         return given if isinstance(given, Assembly) else None
 
 
+FLAT = ("disc", "strip", "plate", "annulus")  # geometries
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface
 
 

@@ -32,6 +32,7 @@ from magshell_fenicsx.parts.pressure.openings import meridian_openings
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
+from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.shells.waves import ExcludedWaves, Waves
@@ -62,7 +63,7 @@ class Probe:
     def at(s: float, azimuth: float, r0: fem.Function) -> "Probe":
         """For a parameter of the meridian with the placement `r0`."""
         V = r0.function_space
-        ends = V.mesh.geometry.x[V.mesh.geometry.dofmap, 0]
+        ends = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0]
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
         local = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
         values, slopes = V.element.basix_element.tabulate(1, local)[:, 0, :, 0]

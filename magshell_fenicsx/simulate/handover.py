@@ -23,6 +23,7 @@ from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.platform import compat
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.modes import ShellModes
@@ -263,7 +264,7 @@ def _sign(model: MeridianModel, wave: Vector) -> float:
 def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) -> Array:
     """Components (n, k) of a field on the meridian at its parameters s."""
     domain = model.meridian.mesh
-    ends = domain.geometry.x[domain.geometry.dofmap, 0]
+    ends = domain.geometry.x[compat.corner_numbers(domain), 0]
     begin = ends.min(axis=1)
     order = np.argsort(begin)
     cells = order[np.clip(np.searchsorted(begin[order], s, side="right") - 1, 0, len(order) - 1)]

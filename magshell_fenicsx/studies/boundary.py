@@ -38,6 +38,7 @@ from magshell_fenicsx.simulate.varied import WAVES, Varied, instability
 from magshell_fenicsx.studies.boundary_journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.boundary_start import Start, start_from
+from magshell_fenicsx.studies.naming import load_said
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, rest_said
 
@@ -192,7 +193,7 @@ def boundary(
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
         if not begin["label"]:
             instability([])
-        once(f"{span.key} = {span.text(value)}: {begin['label']} at {begin['amplitude']} = {begin['value']:.9g}")
+        once(f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
         def followed(sense: int) -> Iterator[str]:
@@ -284,6 +285,7 @@ def _begin(
         "amplitude": located.amplitude,
         "step": located.step,
         "value": state.mu[located.amplitude],
+        "row": _load(located.amplitude, state.mu[located.amplitude], scene.problem),
         "u": text_of(state.u),
         "mu": state.mu,
         "factorisations": scene.newton.factorisation.count,
@@ -315,7 +317,7 @@ def _followed(
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
         beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
         at = f"{row['key']:.9g} {span.unit}".rstrip()
-        say(f"{span.key} = {at}: {row['kind']} at {varied.name} = {row['load']:.9g}{beside}{left}")
+        say(f"{span.key} = {at}: {row['kind']} at {load_said(row, varied.name)}{beside}{left}")
 
     def curve(m: int) -> Boundary:
         return Boundary(varied, varied.name, varied.kind, scales, own.recorded, m)
@@ -351,21 +353,22 @@ def _followed(
 
 
 def _row(varied: Varied, label: Label, locus: Locus, m: int) -> dict[str, Any]:
-    load = locus.state.mu[varied.name]
-    column = amplitude(varied.name).column
-    sizes = sizes_in_units(varied.problem(locus.p))
-    measured = sizes.values({column: load})
     waves = sorted({m, locus.met}) if label == "crossing" else [m]
     return {
         "key": float(locus.p),
-        "load": float(load),
+        **_load(varied.name, locus.state.mu[varied.name], varied.problem(locus.p)),
         "kind": label if label in SPECIAL else varied.kind,
         "mode": ", ".join(f"{WAVES}{each}" for each in waves) if m else varied.mode,
         "error": float(locus.load_error),
         "unstable": int(locus.unstable - (locus.counts[locus.met] if label == "crossing" else 0)),
         "factorisations": int(locus.factorisations),
-        **{name: float(number) for name, number in measured.items()},
     }
+
+
+def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
+    """A load, and what it is in the case's units if it has any, as columns."""
+    measured = sizes_in_units(problem).values({amplitude(name).column: value})
+    return {"load": float(value), **{column: float(number) for column, number in measured.items()}}
 
 
 def _put_together(
@@ -377,7 +380,7 @@ def _put_together(
     special = [row for row in rows if row["kind"] in SPECIAL]
     said = [
         f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
-        + f", load {row['load']:.9g}: {SAID[row['kind']]}"
+        + f", {load_said(row, begin['amplitude'])}: {SAID[row['kind']]}"
         + (f", {row['mode']}" if row["kind"] == "crossing" else "")
         for row in special
     ]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.output.pictures.lines import smooth
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
 from magshell_fenicsx.studies.naming import key_label
 
 MARKS = {"cusp": "o", "turn": "s", "meeting": "D", "crossing": "X"}
@@ -36,6 +36,7 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    rows, label = _in_units(rows, content["load"])
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     parts = [part for _, part in _by_mode(rows)]
     for smooth_part in parts:  # with a corner where two bifurcations cross
@@ -53,7 +54,6 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
         low, high = arms
         x, y = (np.concatenate([one, two[::-1]]) for one, two in zip(_joined(low), _joined(high), strict=True))
         plot.fill(x, y, color="C0", alpha=0.12, linewidth=0)
-    label = quantity(amplitude(content["load"]).column).label
     plot.set(xlabel=key_label(content["key"], content["unit"]), ylabel=label, title=_title(content))
     if plot.get_legend_handles_labels()[1]:
         plot.legend(frameon=False, fontsize=8)
@@ -74,6 +74,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    rows, label = _in_units(rows, content["load"])
     others = [row for row in rows if row["amplitude"] != content["load"]]
     empty = sorted(set(content["values"]) - {row["second"] for row in rows})
     of_plane = bool(others or empty or any(row["kind"] in MARKS for row in rows))
@@ -88,7 +89,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
             text = f"{value:g}".replace("-", "−")
             _line(plot, line, color=plt.cm.viridis(0.9 * shade(value)), marked=True, label=text)
     _marks(plot, "load", [row for row in rows if row not in others])
-    plot.set(xlabel=names[0], ylabel=quantity(amplitude(content["load"]).column).label, title=_title(content))
+    plot.set(xlabel=names[0], ylabel=label, title=_title(content))
     plot.legend(**LEGEND, title=names[1], title_fontsize=8)
     if of_plane:
         _plane(plane, rows, content, empty)
@@ -96,6 +97,12 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
         plane.legend(**LEGEND)
     figure.savefig(file, dpi=200)
     plt.close(figure)
+
+
+def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
+    """Rows whose load is in the case's units if they have it in these, and the label of its axis."""
+    of = shown(amplitude(load).column, {name for row in rows for name in row})
+    return [{**row, "load": row.get(of.name, row["load"])} for row in rows], of.label
 
 
 def _plane(plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]) -> None:

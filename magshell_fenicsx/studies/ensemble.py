@@ -140,7 +140,7 @@ def ensemble(
         said = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
         why = f", {outcome.stopped}" if outcome.stopped else ""
         place = f"{missing.index(key) + 1:5d}/{len(missing)}"
-        yield f"{place}  sample {sample.number}: {said}{why}, {outcome.cpu_s:.1f} s"
+        yield f"{place}  sample {sample.number}: {said}{why}, {outcome.cpu_s:.1f} s CPU"
 
     compute(missing, sample_computed, comm, say)
     rows = [_row(each, folder, scalar) for each in zip(*variants, strict=True)]

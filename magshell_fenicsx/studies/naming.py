@@ -1,8 +1,10 @@
 """Keys and results as a paper names them, for pictures."""
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
-from magshell_fenicsx.quantities.registry import QUANTITIES, endings
+from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown
 from magshell_fenicsx.studies.points import short
 
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
@@ -56,6 +58,18 @@ def key_symbol(key: str) -> str:
     return f"{symbol} = " if symbol else f"{key_words(key)} "
 
 
+def load_said(row: Mapping[str, Any], name: str) -> str:
+    """The load of a row of a boundary in words, in the case's units if the row has it in these.
+
+    Examples
+    --------
+    >>> load_said({"load": 0.5}, "pressure"), load_said({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
+    ('p/pc = 0.5', 'p = 61.25 Pa')
+    """
+    of = shown(amplitude(name).column, row)
+    return f"{of.plain} = {row.get(of.name, row['load']):.9g}" + (f" {of.si}" if of.name in row else "")
+
+
 def split_unit(result: str) -> tuple[str, str] | None:
     """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
     units = endings()
@@ -98,8 +112,8 @@ def result_label(result: str) -> str:
     ('applied field  $B_\\\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
     """
     for each in QUANTITIES.values():
-        for shown in (each, *each.in_units):
-            if shown.name == result:
-                return shown.label
+        for column in (each, *each.in_units):
+            if column.name == result:
+                return column.label
     unit = "Hz" if result.startswith("hertz_") else given[1] if (given := split_unit(result)) else ""
     return result_words(result) + (f"  ({unit})" if unit else "")

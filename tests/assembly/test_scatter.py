@@ -48,6 +48,7 @@ def dense(V: fem.FunctionSpace, same: np.ndarray, cells: tuple[np.ndarray, ...],
     return K
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("degree", [1, 2, 4])
 @pytest.mark.parametrize("held", ["nothing", "an edge", "a component"])
 def test_every_entry(degree: int, held: str) -> None:

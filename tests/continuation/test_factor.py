@@ -159,6 +159,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, number: int) -> Factorisation:
     return Factorisation(MPI.COMM_SELF)
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("triangle", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_definite_or_not(seed: int, triangle: bool) -> None:

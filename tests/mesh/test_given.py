@@ -91,6 +91,7 @@ def test_part_of_another_mesh() -> None:
     assert home.field(of_x, "x").nodal.mean(axis=(1, 2)) == pytest.approx(centres)
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("shape", ["flat", "upright", "tube"])
 def test_normals_of_equal_halves_do_not_depend_on_numbers(shape: str) -> None:
     """Half of the area turned over, as dolfinx refines meshes: up, along e2 where that decides nothing, outwards."""

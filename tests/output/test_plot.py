@@ -18,6 +18,7 @@ from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.pictures.plot import Drawn, draw, draw_animation, in_true_time, plot, plot_runs
+from magshell_fenicsx.output.pictures.readings import readings_figure
 from magshell_fenicsx.output.pictures.several import _free, add_shapes, runs_figure
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.problem.wanted import OutputSection
@@ -46,6 +47,7 @@ def pixels(file: Path) -> np.ndarray:
     return np.asarray(Image.open(file).convert("RGB"), dtype=int)
 
 
+@pytest.mark.telling
 def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) -> None:
     """Without summary, as a killed run is: the same files with the same pixels."""
     there = {file.name for file in run.glob("*.png")}
@@ -173,6 +175,19 @@ def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
     said = r"copy: its curve is force over w_over_h, that of .* p_over_pc over volume_change: draw"
     with pytest.raises(CaseError, match=said):
         runs_figure({run: rows[run], again: other}, OutputSection())
+
+
+def test_what_sensors_read_is_a_curve(run: Path) -> None:
+    """In mT over the load, through the values of path.csv in T; a component that is zero has no line."""
+    rows = read_rows(run / "path.csv")
+    read = [row | {"hall_Bx": 1e-12, "hall_By": -2e-3, "hall_Bz": 1e-3 * float(row["p_over_pc"])} for row in rows]
+    case = {"sensors": {"hall": {}}, "magnetic": {"remanent": {"flux_density": 0.08}}}
+    (axes,) = readings_figure(read, "pressure", case, OutputSection()).axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (r"pressure  $p/p_\mathrm{c}$", "field at hall  (mT)")
+    assert axes.get_legend_handles_labels()[1] == ["fold", "$B_y$", "$B_z$"]
+    last = [line.get_xydata()[-1] for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xydata()) > 2]
+    load = float(rows[-1]["p_over_pc"])
+    assert np.array(last) == pytest.approx(np.array([[load, -2.0], [load, load]]))
 
 
 def test_a_displacement_by_rounding_is_no_curve(run: Path) -> None:

@@ -214,6 +214,17 @@ def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:
     assert "no error estimate. For one: give the case mesh: {tolerance: 1e-3}" in page(tmp_path, [FOLD]).text
 
 
+def test_a_flat_shell_has_no_classical_pressure(tmp_path: Path) -> None:
+    """It is said of a pressure in pascals alone, and nowhere without a pressure; a time in seconds is said once."""
+    case = SUMMARY["case"] | {"shell": {"geometry": "strip"}, "loading": {"kind": "pressure", "until": "target"}}
+    row = {"label": "target", "amplitude": "pressure", "p_over_pc": 0.5, "pressure_Pa": 10.0}
+    assert "target: p = 10 Pa," in page(tmp_path, [row], case=case, knockdown=None).text
+    moved = {"label": "target", "amplitude": "time", "time": 2.5, "time_s": 2.5}
+    found = page(tmp_path, [moved], case=case, knockdown=None).text
+    assert "target: t = 2.5 s," in found
+    assert "pc" not in found[: found.index("Path")]
+
+
 def test_units_of_ones_own(tmp_path: Path) -> None:
     """Nobody knows what an amount of them is in pascals."""
     found = page(tmp_path, [FOLD], dimensions=SUMMARY["dimensions"] | {"units": "the case's own"}, in_units={})

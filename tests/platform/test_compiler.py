@@ -35,6 +35,7 @@ def test_one_compiles_and_the_others_wait(cache: Path) -> None:
     assert [file.suffix for file in cache.iterdir()] == [".so"]
 
 
+@pytest.mark.telling
 def test_options_and_names_make_another_library(cache: Path) -> None:
     made = {
         compiler.library(*of)

@@ -131,6 +131,7 @@ def test_torn_files(whole: Whole, tmp_path: Path, no_pictures: None) -> None:
     check_fields(out)
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("whole", ["meridian"], indirect=True)
 def test_complete_already(whole: Whole) -> None:
     before = (whole.out / "summary.json").stat()

@@ -44,6 +44,7 @@ def test_two_thirds_law() -> None:
     assert exponent == pytest.approx(2 / 3, abs=0.01)
 
 
+@pytest.mark.telling
 @pytest.mark.usefixtures("no_pictures")
 def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
     """The file has the mode on the nodes of the deformed surface, which other code evaluates."""

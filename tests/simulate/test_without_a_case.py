@@ -6,7 +6,7 @@ A function that a formula equals gives the numbers of the formula, a mesh those 
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,7 @@ def function(dome: Dome, space: tuple[Any, ...], of: Any) -> fem.Function:
     return found
 
 
+@pytest.mark.telling
 def test_numbers_of_the_case_on_the_same_mesh(dome: Dome) -> None:
     case = {
         "shell": {"geometry": "mesh", "file": str(dome[2]), "radius": "25 mm", **MATERIAL},
@@ -227,6 +228,25 @@ def cap(*parts: Any, **sections: Any) -> Any:
     """A problem without a mesh, of which only the words count."""
     shell = ms.Shell("cap", polar=40, radius=1.0, thickness=0.02, poisson_ratio=0.3)
     return ms.Problem(shell, ms.Clamped("rim"), *parts, **sections)
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        (lambda: ms.Shell("cap", thicknes=0.1), "Problem: shell.thicknes: unknown key; did you mean thickness?"),
+        (lambda: ms.Shell("strip", widht=0.1), "Problem: shell.widht: unknown key; did you mean width?"),
+        (lambda: ms.Shell("hemisfere"), "unknown geometry; did you mean hemisphere?"),
+        (lambda: ms.Step("indentaton"), "unknown kind of step; did you mean indentation?"),
+        (lambda: ms.Pressure(pint=3), "Problem: loading.pint: unknown key; did you mean points?"),
+        (lambda: ms.Force("tip", dept=3), "Problem: loading.dept: unknown key; did you mean depth?"),
+        (lambda: ms.Section("fundation", stiffness=1), "unknown section; did you mean foundation?"),
+        (lambda: ms.Section("foundation", stifness=1), "unknown key; did you mean stiffness?"),
+    ],
+)
+def test_a_slip_is_refused_where_it_is_written(written: Callable[[], Any], said: str) -> None:
+    """Not by the problem, which may be made far from there."""
+    with pytest.raises(ms.CaseError, match=re.escape(said)):
+        written()
 
 
 def test_what_is_given_twice_is_refused() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import magshell, read_path, started
-from conftest import CASES
+from conftest import CAP, CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
@@ -213,12 +213,33 @@ def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], sai
         ms.boundary(ARCH, over, settings, tmp_path / "b")
 
 
+@pytest.mark.telling
 def test_through_a_field_of_zero(tmp_path: Path) -> None:
     """Where the case starts; at the ends against the axisymmetric reference of tests/cases/test_cases.py."""
     found = ms.boundary(CASES / "dimple_buckling.yaml", "magnetic.lambda_m=-0.00184:0.00184:3", out=tmp_path / "b")
     ends = {row["key"]: row["load"] for row in (found.rows[0], found.rows[-1])}
     assert ends == pytest.approx({-0.00184: 0.120723848, 0.00184: 0.552053778}, rel=1e-6)
     assert not found.special
+
+
+def test_a_load_is_in_the_units_of_the_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said and drawn is the column in Pa: 2 E/sqrt(3 (1 - nu^2)) (h/R)^2 times the load of the same row."""
+    import matplotlib.pyplot as plt
+
+    drawn: list[Any] = []
+    monkeypatch.setattr(plt, "close", drawn.append)
+    case = tmp_path / "cap.yaml"
+    case.write_text(CAP)
+    said: list[str] = []
+    found = ms.boundary(case, "shell.youngs_modulus=1.3 MPa:1.31 MPa:1", out=tmp_path / "b", say=said.append)
+    for row in found.rows:
+        unit = 2e6 * row["key"] / np.sqrt(3 * (1 - 0.49**2)) * (0.8 / 40) ** 2
+        assert row["pressure_Pa"] == pytest.approx(unit * row["load"], rel=1e-12)
+        assert any(f"p = {row['pressure_Pa']:.9g} Pa" in line for line in said)
+    (plot,) = drawn[0].axes
+    assert plot.get_ylabel() == "pressure  $p$  (Pa)"
+    heights = np.concatenate([line.get_ydata() for line in plot.lines])
+    assert heights.min() == pytest.approx(min(row["pressure_Pa"] for row in found.rows))
 
 
 @pytest.mark.slow

@@ -129,6 +129,7 @@ def test_too_many_points_and_a_key_that_is_also_set() -> None:
         make_points(DIMPLE, parse_axes(["mesh.degree=3,4"]), ["mesh.degree=3"])
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_invalid_point_is_one_message_and_nothing_is_computed(tmp_path: Path, ranks: int) -> None:
     done = magshell("sweep", PLATE, "--over", "shell.poisson_ratio=0.3,0.7", "--out", tmp_path / "out", ranks=ranks)

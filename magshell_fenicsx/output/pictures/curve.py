@@ -1,7 +1,7 @@
 """The load-displacement or pressure-volume curve as a picture, and natural frequencies along a path."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ from magshell_fenicsx.output.pictures.lines import (
     is_unstable,
     lines_of,
     named,
+    of_load,
     place,
 )
 from magshell_fenicsx.output.pictures.scales import number_format
@@ -32,6 +33,7 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+PlaceOf = Callable[[Row], tuple[float, float]]
 DASHED = (0, (2, 1.2))
 NARROW = 0.3  # of the figure: few numbers fit below
 MARKS = {"fold": "o", "bifurcation": "D"}
@@ -143,21 +145,28 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
 
-def draw_lines(axes: "Axes", of: Part, colour: str = "C0") -> list[Array]:
-    """Draw the lines, points and marks of a part; its smooth curves (2, n)."""
-    drawn = list[Array]()
+def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | None = None) -> list[Array]:
+    """Draw the lines, points and marks of a part; its smooth curves (2, n).
+
+    Parameters
+    ----------
+    place_of
+        The coordinates of a row; by default those of the curve of the amplitude.
+    """
+    drawn, at = list[Array](), place_of or (lambda row: place(row, of.amplitude))
+    load = None if place_of else of_load(of.amplitude)
     for line in lines_of(of):
-        curve = line.joined(*zip(*(place(row, of.amplitude) for row in line.rows), strict=True))
+        curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
         drawn.append(curve)
         for first, last, unstable in line.pieces:
             piece = curve[:, first * FINE : last * FINE + 1]
             axes.plot(*piece, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
-        dots = [place(row, of.amplitude) for row in line.rows if row["label"] in ("target", "step", "field")]
+        dots = [at(row) for row in line.rows if row["label"] in ("target", "step", "field")]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color=colour, markersize=3.5)
     for row in (row for row in of.rows if row["label"] in LOCATED):
         kind = str(row["label"])
         axes.plot(
-            *place(row, of.amplitude),
+            *at(row),
             MARKS[kind],
             color="C3",
             markerfacecolor="white",
@@ -172,7 +181,8 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0") -> list[Array]:
 def hidden(axes: "Axes", of: Part) -> Array | None:
     """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can be seen."""
     for line in lines_of(of):
-        curve = line.joined(*zip(*(place(row, of.amplitude) for row in line.rows), strict=True))
+        places = [place(row, of.amplitude) for row in line.rows]
+        curve = line.joined(*zip(*places, strict=True), of_load=of_load(of.amplitude))
         for first, last, unstable in line.pieces:
             piece = curve[:, first * FINE : last * FINE + 1]
             size = np.ptp(axes.transData.transform(piece.T), axis=0) * 72 / axes.figure.dpi

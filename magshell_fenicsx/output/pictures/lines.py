@@ -88,10 +88,13 @@ class Line:
     ----------
     in_time
         Whether the points are those of a motion, joined by a spline over the time.
+    amplitude
+        That of its curve.
     """
 
     rows: Sequence[Row]
     in_time: bool = False
+    amplitude: str = ""
 
     @property
     def unstable(self) -> list[bool]:
@@ -111,11 +114,23 @@ class Line:
             parts.append((numbers[0], numbers[-1] + 1, unstable))
         return parts
 
-    def joined(self, x: Sequence[float], y: Sequence[float]) -> Array:
-        """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows."""
+    @property
+    def level(self) -> list[int]:
+        """Its ends, 0 and -1, at which its amplitude has an extreme: a fold in that."""
+        return [i for i in (0, -1) if (self.rows[i]["label"], self.rows[i]["amplitude"]) == ("fold", self.amplitude)]
+
+    def joined(self, x: Sequence[float], y: Sequence[float], *, of_load: int | None = None) -> Array:
+        """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows.
+
+        Parameters
+        ----------
+        of_load
+            Which of the coordinates is its amplitude, 0 or 1; None if none is.
+        """
         if self.in_time:
             return splined(x, y, [float(row["time"]) for row in self.rows])
-        return smooth(x, y, [row["label"] in LOCATED for row in self.rows])
+        level = [] if of_load is None else [(of_load, end) for end in self.level]
+        return smooth(x, y, [row["label"] in LOCATED for row in self.rows], level)
 
 
 def lines_of(part: Part) -> list[Line]:
@@ -123,7 +138,8 @@ def lines_of(part: Part) -> list[Line]:
     path = [row for row in part.rows if row["label"] != SOLUTION]
     in_time = part.amplitude == "time"
     branches = sorted({int(row["branch"]) for row in path})
-    return [Line(_line([row for row in path if row["branch"] == b], part.amplitude), in_time) for b in branches]
+    of_branches = [_line([row for row in path if row["branch"] == b], part.amplitude) for b in branches]
+    return [Line(rows, in_time, part.amplitude) for rows in of_branches]
 
 
 def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
@@ -135,7 +151,17 @@ def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
     return own + [row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0]
 
 
-def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ()) -> Array:
+def of_load(amplitude: str) -> int:
+    """Which coordinate of its curve an amplitude is."""
+    return 0 if registered(amplitude).sideways else 1
+
+
+def smooth(
+    x: Sequence[float],
+    y: Sequence[float],
+    located: Sequence[bool] = (),
+    level: Sequence[tuple[int, int]] = (),
+) -> Array:
     """A smooth curve (2, FINE (n - 1) + 1) through n points; the parameter is the root of the scaled chord.
 
     Cubics with the slopes of parabolas through three points, limited so that what rises from point to point rises
@@ -146,6 +172,8 @@ def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ())
     ----------
     located
         Whether each point is a fold or a bifurcation, where a coordinate that turns has its extreme.
+    level
+        Which coordinate has its extreme at which end, 0 or -1.
     """
     xy = np.array([x, y], float)
     scale = np.ptp(xy, axis=1)
@@ -155,6 +183,8 @@ def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ())
     chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, 1e-12)))])
     ends = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
     slopes = np.array([_slopes(chord, values, ends) for values in xy])
+    for coordinate, end in level:
+        slopes[coordinate, end] = 0.0
     return np.asarray(scipy.interpolate.CubicHermiteSpline(chord, xy, slopes, axis=1)(_fine(chord)))
 
 

@@ -19,6 +19,7 @@ from magshell_fenicsx.output.pictures.layout import drawing, written
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.readings import readings_figure
 from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.view import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
@@ -39,6 +40,11 @@ class Drawn:
     options
         Keys of the section `output` in place of those of the case.
 
+    Attributes
+    ----------
+    resolved
+        The case as in summary.json.
+
     Raises
     ------
     CaseError
@@ -49,15 +55,15 @@ class Drawn:
         self.folder = folder
         self.rows = _rows(folder)
         self.on_path = [row for row in self.rows if row["label"] != SOLUTION]
-        self._case = case_in(folder)
-        self.headline = headline(self._case, self.rows)
-        self.style = style_of(self._case, options)
+        self.resolved = case_in(folder)
+        self.headline = headline(self.resolved, self.rows)
+        self.style = style_of(self.resolved, options)
         self._points: dict[int, tuple[Surface, About]] = {}
 
     @property
     def place(self) -> str:
         """What the point of w_pole_over_h is called."""
-        return pole_of(self._case)
+        return pole_of(self.resolved)
 
     @cached_property
     def camera(self) -> Camera:
@@ -188,6 +194,8 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
                 parts = worth_drawing(drawn_parts(run.rows, amplitude))
                 add_shapes(curve, parts, chosen, style, run.camera)
         yield from written(curve, style, "curve")
+        if run.resolved.get("sensors"):
+            yield from written(readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):

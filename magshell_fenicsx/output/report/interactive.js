@@ -146,7 +146,7 @@
     for (let i = n - 1; i >= 0; i--) out[i] = (right[i] - (i + 1 < n ? up[i] * out[i + 1] : 0)) / middle[i];
     return out;
   };
-  const joined = (x, y, located, times) => {
+  const joined = (x, y, located, times, level = []) => { // level: which coordinate has its extreme at which end, 0 or -1
     const later = times && times.map((t, i) => i === 0 || t > times[i - 1]);
     if (later && later.filter(Boolean).length >= 4 && later.slice(2).every(Boolean)) {
       const skip = later[1] ? 0 : 1, rest = v => v.slice(skip), t = rest(times);
@@ -157,26 +157,57 @@
     if (x.length < 2) return [x, y];
     const span = v => Math.max(...v) - Math.min(...v) || 1, chord = [0];
     for (let i = 1; i < x.length; i++) chord.push(last(chord) + Math.sqrt(Math.max(Math.hypot((x[i] - x[i - 1]) / span(x), (y[i] - y[i - 1]) / span(y)), 1e-12)));
-    return [x, y].map(v => hermite(chord, v, slopesOf(chord, v, located)));
+    const slopes = [x, y].map(v => slopesOf(chord, v, located));
+    for (const [c, end] of level) slopes[c][end < 0 ? x.length - 1 : 0] = 0;
+    return [x, y].map((v, c) => hermite(chord, v, slopes[c]));
   };
 
   const on = name => about.columns[name].values.map(v => about.columns[name].sign * v);
   const palette = ["#1f77b4", "#ff7f0e", "#9467bd", "#8c564b", "#17becf", "#7f7f7f", "#bcbd22", "#e377c2"];
   const isLocated = i => about.labels[i] === "fold" || about.labels[i] === "bifurcation";
-  const drawCurve = () => {
+  // As in curve.png (output/pictures/curve.py): an unstable part that its marks hide is drawn once more in an inset.
+  const hiddenBelow = 16, around = 0.8, insetSize = 0.4, insetGap = 0.14, crowded = 0.02, insets = new Map();
+  const limits = v => [Math.min(...v), Math.max(...v)];
+  const insetOf = (pieces, curves) => { // null if all can be seen, or no corner is free
+    const axes = ["x", "y"].map(c => part("curve2d")._fullLayout[`${c}axis`]);
+    const inside = (c, v) => (v - axes[c].range[0]) / (axes[c].range[1] - axes[c].range[0]);
+    const hidden = pieces.find(p => Math.max(...p.map((v, c) => Math.abs(inside(c, limits(v)[1]) - inside(c, limits(v)[0])) * axes[c]._length)) < hiddenBelow);
+    if (!hidden) return null;
+    const box = hidden.map(limits).map(([low, high]) => { const more = around * (high - low || 1e-9 * Math.abs(high) || 1e-9); return [low - more, high + more]; });
+    const far = 0.97 - insetSize, corners = [[far, insetGap], [insetGap, insetGap], [far, far], [insetGap, far]];
+    const points = curves.flatMap(c => c[0].map((v, i) => [inside(0, v), inside(1, c[1][i])]));
+    const covered = ([left, low]) => points.filter(([u, v]) => u > left - insetGap && u < left + insetSize && v > low - insetGap && v < low + insetSize).length / points.length;
+    const best = corners.reduce((a, b) => covered(b) < covered(a) ? b : a);
+    if (covered(best) > crowded) return null;
+    const middle = box.map(([low, high]) => (low + high) / 2), at = middle.map((v, c) => inside(c, v));
+    const nearest = at.map((v, c) => Math.min(Math.max(v, best[c]), best[c] + insetSize) - v); // the place of the inset that is nearest to it
+    return {box, corner: best, middle, way: [nearest[0] * axes[0]._length, -nearest[1] * axes[1]._length]};
+  };
+  const withInset = (traces, layout, inset) => {
+    const own = (c, other) => ({domain: [inset.corner[c], inset.corner[c] + insetSize], anchor: other, range: inset.box[c], nticks: 4, tickfont: {size: 9},
+      showline: true, mirror: true, linecolor: "#666", ticks: "outside", ticklen: 3, showgrid: false, zeroline: false, exponentformat: "power"});
+    const again = traces.map(t => ({...t, xaxis: "x2", yaxis: "y2", showlegend: false, mode: t.mode.replace("+text", "")}));
+    const frame = {type: "rect", xref: "x", yref: "y", x0: inset.box[0][0], x1: inset.box[0][1], y0: inset.box[1][0], y1: inset.box[1][1], line: {color: "#666", width: 1}};
+    const leads = {x: inset.middle[0], y: inset.middle[1], xref: "x", yref: "y", text: "", showarrow: true, arrowhead: 0, arrowwidth: 0.8, arrowcolor: "#999", ax: inset.way[0], ay: inset.way[1]};
+    return [[...traces, ...again], {...layout, xaxis2: own(0, "y2"), yaxis2: own(1, "x2"), shapes: [frame], annotations: [leads]}];
+  };
+  const drawCurve = async () => {
     const x = on(part("across").value), y = on(part("up").value), traces = [], step = +part("step").value;
     const shown = step < 0 ? about.steps : about.steps.slice(step, step + 1), dashes = {false: "solid", true: "dash"};
     const hover = i => `point ${about.points[i]}: ${about.labels[i]}${about.unstable[i] ? ", unstable" : ""}<br>%{x:.6g}, %{y:.6g}<extra></extra>`;
     const named = new Set(), once = name => { const first = !named.has(name); named.add(name); return {name, showlegend: first, legendgroup: name}; };
-    const within = new Set(shown.flatMap(s => s.rows)), several = new Set();
+    const within = new Set(shown.flatMap(s => s.rows)), several = new Set(), curves = [], pieces = [];
     shown.forEach((s, n) => {
       const color = palette[n % palette.length];
       for (const l of s.lines) {
         const pick = v => l.rows.map(i => v[i]), is = l.rows;
-        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null);
+        const load = [part("across").value, part("up").value].indexOf(s.load), level = load < 0 ? [] : l.level.map(end => [load, end]);
+        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null, level);
+        curves.push(curve);
         for (const [first, end, unstable] of l.pieces) {
           const cut = v => v.slice(first * fine, end * fine + 1), name = (step < 0 ? s.title + ", " : "") + (unstable ? "unstable" : "stable");
           several.add(unstable);
+          if (unstable && isLocated(is[end])) pieces.push(curve.map(cut));
           traces.push({x: cut(curve[0]), y: cut(curve[1]), mode: "lines", line: {color, width: 1.6, dash: dashes[unstable]}, hoverinfo: "skip", ...once(name)});
         }
         const dots = is.filter(i => !isLocated(i));
@@ -202,8 +233,15 @@
     const now = about.frames[state.frame];
     traces.push({x: [x[now]], y: [y[now]], mode: "markers", marker: {size: 13, color: "rgba(0,0,0,0)", line: {color: "#000", width: 2}}, hoverinfo: "skip", showlegend: false});
     const axis = name => ({title: {text: about.columns[part(name).value].label, standoff: 8}, automargin: true, zeroline: true, zerolinecolor: "#ccc", showline: true, mirror: true, ticks: "outside", showgrid: false, exponentformat: "power"});
-    return Plotly.react("curve2d", traces, {xaxis: axis("across"), yaxis: axis("up"), margin: {l: 60, r: 12, t: 10, b: 45}, hovermode: "closest",
-      showlegend: several.size > 1 || named.size > 1, legend: {orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: {size: 11}}}, {...plain, displayModeBar: false});
+    const layout = {xaxis: axis("across"), yaxis: axis("up"), margin: {l: 60, r: 12, t: 10, b: 45}, hovermode: "closest",
+      showlegend: several.size > 1 || named.size > 1, legend: {orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: {size: 11}}};
+    const draw = (...what) => Plotly.react("curve2d", ...what, {...plain, displayModeBar: false});
+    const key = [part("across").value, part("up").value, step, part("curve2d").clientWidth].join();
+    if (!insets.has(key)) {
+      await draw(traces, layout); // which finds the ranges of the axes
+      insets.set(key, insetOf(pieces, curves));
+    }
+    return insets.get(key) ? draw(...withInset(traces, layout, insets.get(key))) : draw(traces, layout);
   };
   const tell = () => {
     const i = about.frames[state.frame], s = about.steps[stepOf(state.frame)], c = s && about.columns[s.axes.find(n => n === s.varied)] || (s && about.columns[s.varied]);

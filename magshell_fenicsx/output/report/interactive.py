@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
-from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
+from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named, of_load
 from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, from_zero
 from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, near_solids, run_camera, tessellated
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
@@ -222,9 +222,15 @@ def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:
         "title": part.title or varied.words,
         "axes": [q.name for q in axes_for(part)],
         "varied": varied.name,
+        "load": axes_for(part)[of_load(part.amplitude)].name,
         "rows": [at[int(row["point"])] for row in part.rows],
         "lines": [
-            {"rows": [at[int(row["point"])] for row in it.rows], "pieces": it.pieces, "in_time": it.in_time}
+            {
+                "rows": [at[int(row["point"])] for row in it.rows],
+                "pieces": it.pieces,
+                "in_time": it.in_time,
+                "level": it.level,
+            }
             for it in lines_of(part)
         ],
     }

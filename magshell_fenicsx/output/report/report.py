@@ -29,7 +29,7 @@ from magshell_fenicsx.output.report.verdict import (
     verdict,
 )
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import headline, pole_of, shell_of
+from magshell_fenicsx.output.store.known import headline, is_flat, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
 from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -38,6 +38,7 @@ NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
     "curve.png": "Load over displacement; dashed where the shell is unstable.",
+    "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
     "solutions.png": "The end of the path, and the solutions that the search has found.",
     "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
     "animation.gif": "The shell along the path.",
@@ -49,7 +50,7 @@ PICTURES = {  # in the order of the report
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
     "gradients.png": "Where a result would change most: red where more of a field raises it, blue where it lowers it.",
-    "frequencies.png": "Natural frequencies squared along the path; below zero the shell is unstable.",
+    "frequencies.png": "Natural frequencies; below zero the shell is unstable.",
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
 SMALL = ("curve.png", "shell.png")  # beside each other
@@ -113,13 +114,14 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
     """The values of the template."""
     summary, lines = read_run(folder)
     played = interactive(folder, summary["case"]) if playable else None  # it moves in place of the animation
+    classical = not is_flat(summary["case"]) or any(float(line["p_over_pc"]) for line in lines)
     path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"]))
     return {
         "name": folder.resolve().name,
         "summary": summary,
         "verdict": verdict(summary, lines),
-        "groups": _groups(summary),
-        "dimensions": _dimensions(summary),
+        "groups": _groups(summary, classical),
+        "dimensions": _dimensions(summary, classical),
         "pictures": list(_pictures(folder, _shown(summary["case"], read_rows(folder / "path.csv")), played is None)),
         "interactive": played,
         "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
@@ -149,7 +151,8 @@ def _head(name: str, line: Line) -> Markup:
     return Markup("{} ({})").format(where, of_column.shown_unit) if of_column.shown_unit else where
 
 
-def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
+def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
+    """Name and value of the numbers without units; `classical`: whether p_c says something of the run."""
     of, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
@@ -160,14 +163,14 @@ def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
         "ν": of["poisson_ratio"],
         f"λ<sub>m</sub> = {field}": of["lambda_m"],
         "Λ<sub>m</sub> = λ<sub>m</sub>R/h": of["Lambda_m"],
-        "p<sub>c</sub>/E": of["pc_over_E"],
+        **({"p<sub>c</sub>/E": of["pc_over_E"]} if classical else {}),
     }
     if isinstance(chi, int | float):
         named["susceptibility χ"] = chi
     return [(Markup(name), number(v)) for name, v in named.items()]
 
 
-def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
+def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup, str]]:
     """Name, value and unit of the quantities that the case gives with units."""
     dims, magnetic, measured = summary["dimensions"], summary["case"].get("magnetic") or {}, summary.get("in_units", {})
     named = {
@@ -175,7 +178,7 @@ def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
         "thickness h": (dims["thickness"], "m"),
         "Young’s modulus E": (dims["youngs_modulus"], "Pa"),
         "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
-        "classical pressure p<sub>c</sub>": (measured.get("classical_pressure_Pa"), "Pa"),
+        "classical pressure p<sub>c</sub>": (measured.get("classical_pressure_Pa") if classical else None, "Pa"),
         "unit of the force, 2πD/R": (measured.get("unit_force_N"), "N"),
         "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
         "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),

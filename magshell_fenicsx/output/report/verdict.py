@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.known import pole_of, read_summary, shell_of
+from magshell_fenicsx.output.store.known import is_flat, pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, quantity, shown
@@ -250,10 +250,16 @@ def _barrier(summary: Summary) -> Markup:
 
 
 def value(line: Line, summary: Summary) -> Markup:
-    """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)"."""
+    """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)", or in units alone.
+
+    That is what is in these units already, "t = 2 s", and the pressure on a flat shell, which p_c says nothing of.
+    """
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
     size = shown(name, line)
+    in_that_unit = size.symbol == quantity(name).symbol and float(line[size.name]) == float(line[name])
+    if size.name != name and (in_that_unit or (name == "p_over_pc" and is_flat(summary["case"]))):
+        return Markup("{} = {} {}").format(head(size), number(float(line[size.name])), size.si)
     measured = Markup(" ({} {})").format(number(float(line[size.name])), size.si) if size.name != name else ""
     return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
 

@@ -13,6 +13,7 @@ from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.shape.sections import FLAT
 
 SUMMARY = "summary.json"
 NUMBER, NOTHING = (int, float), type(None)
@@ -128,6 +129,11 @@ def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
 def shell_of(case: Mapping[str, Any]) -> Mapping[str, Any]:
     """The section of the shell in a case; several are one of geometry: mesh."""
     return case.get("shell") or ({"geometry": "mesh"} if case.get("shells") else {})
+
+
+def is_flat(case: Mapping[str, Any]) -> bool:
+    """Whether the shell of a case is drawn flat, so that the pressure p_c of a sphere is a unit at most."""
+    return shell_of(case).get("geometry") in FLAT
 
 
 def pole_of(case: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ FIRST = "# files that magshell_fenicsx has written here: another run replaces th
 MESH = "mesh.json"  # the mesh chosen for a tolerance
 OF_PATH = (checkpoint.NAME, "path.csv", MESH)
 NEW = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
-DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions", "gradients")
+DRAWN = (*PICTURES, "curve", "sensors", "instabilities", "modes", "frequencies", "solutions", "gradients")
 # every name that a run, or `plot` after it, may write, also while it writes
 NAMES = re.compile(
     r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"

@@ -74,6 +74,7 @@ def test_excluded_modes(shell: Shells) -> None:
     assert difference(modes.system, random_displacement(model, 1e-3), MU) <= 1e-12
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("condition", ["free", "simply supported", "clamped"])
 def test_edge_conditions(condition: Condition) -> None:
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": condition}, Loads(pressure=True))

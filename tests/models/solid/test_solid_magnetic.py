@@ -43,6 +43,7 @@ def block(law: RemanenceLaw) -> SolidModel:
     return SolidModel(plate(0.8, H), MATERIAL, NEO_HOOKEAN, {}, Loads(magnetic=Magnetisation(BR, BA, law=law)))
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize("name", DEFORMATIONS)
 def test_homogeneous_deformations(name: str) -> None:
     """The energy is -Ba . (R - 1) Br of the volume, and its tangent and residual have values at equal stretches too.

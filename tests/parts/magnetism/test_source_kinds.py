@@ -115,6 +115,7 @@ def written(folder: Path, form: str, b: np.ndarray, G: np.ndarray, top: float = 
 FIELD, SLOPE = np.array([3.0, 0.0, 4.0]), np.array([[6.0, 0, 2], [0, 1, 0], [2, 0, -7]])
 
 
+@pytest.mark.telling
 @pytest.mark.parametrize(("form", "slope"), [("csv", False), ("npz", True), ("vtr", True)])
 def test_grid_of_a_built_in_field(form: str, slope: bool, tmp_path: Path) -> None:
     """A uniform field, and a constant gradient: the deflection is that of the built-in one to 1e-6."""
