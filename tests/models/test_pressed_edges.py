@@ -105,10 +105,11 @@ def test_a_steep_edge(tmp_path: Path) -> None:
     assert seen["tip_ux"] == pytest.approx(expected["tip"], rel=2e-3)
     system, exact, mu = scene.model.system, last.point.state.u, last.point.state.mu
     rough = system.held(np.random.default_rng(0).standard_normal(system.size))
-    u, errors = exact + 2e-6 * h * rough, list[float]()
+    u, errors = exact + 1e-5 * h * rough, list[float]()
     for _ in range(5):
         u = u - spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
         errors.append(float(np.abs(u - exact).max()) / h)
-    below = [(a, b) for a, b in pairwise(errors) if b > 1e-13]
+    below = [(a, b) for a, b in pairwise(errors) if b > 1e-12]
     assert errors[-1] < 1e-11
+    assert below
     assert all(b < 1e4 * a**2 for a, b in below), errors
