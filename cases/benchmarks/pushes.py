@@ -109,7 +109,7 @@ def case(file: Path, seed: int) -> Case:
         "supports": ["right"],
         "rotation": {
             "axis": [float(a) for a in axis], "point": [float(rng.uniform(0.6, 0.75)), WIDTH / 2, 0],
-            "angle": float(rng.uniform(150, 240)),
+            "angle": float(rng.uniform(180, 300)),
         },
         "translation": [0, float(rng.uniform(-0.1, 0.1)), float(h * rng.uniform(-8, -2))],
     }  # fmt: skip

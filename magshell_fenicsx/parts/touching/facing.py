@@ -174,16 +174,16 @@ class Facing:
         at = at.of(np.lexsort((at.distance, at.point)))
         (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
         off = self.x_of(points, r)[at.point] - y
-        way, side = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
+        way, numbers = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
         rest = np.arange(len(off))
         for number_of_way in range(WAYS - 1):
             first = np.flatnonzero(np.diff(at.point[rest], prepend=-1))
             nearest = np.repeat(rest[first], np.diff([*first, len(rest)]))
             alike = np.sum(way[rest] * way[nearest], axis=1) > ALIKE
-            side[rest[alike]] = number_of_way
+            numbers[rest[alike]] = number_of_way
             rest = rest[~alike]
-        at = replace(at, side=side)
-        order = np.lexsort((at.distance, side, at.point))
+        at = replace(at, side=numbers)
+        order = np.lexsort((at.distance, numbers, at.point))
         at = at.of(order)
         first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))

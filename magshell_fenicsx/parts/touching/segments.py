@@ -154,7 +154,7 @@ class Pieces:
         c, after = self.corners, np.roll(self.corners, -1, axis=1)
         apart = np.linalg.norm(c - after, axis=2) > CLOSE
         on = np.abs(np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)) < CLOSE
-        ends = apart & (on & np.roll(on, -1, axis=1) & open_sides[self.cell][:, None]).any(axis=2)
+        ends = np.asarray(apart & (on & np.roll(on, -1, axis=1) & open_sides[self.cell][:, None]).any(axis=2))
         whole = (apart.sum(axis=1) == 3) & (ends.sum(axis=1) <= 1)
         middle = np.zeros((len(c), 2))
         middle[~whole] = centroid(c[~whole])
