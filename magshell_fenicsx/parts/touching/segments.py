@@ -160,7 +160,7 @@ class Pieces:
         middle[~whole] = centroid(c[~whole])
         n, k = np.nonzero(apart & ~whole[:, None])
         sides = c[n, k] - middle[n], after[n, k] - middle[n]
-        fans = Triangles(self.cell[n], self.faces[n], middle[n], *sides, ends[n, k])
+        fans = Triangles(self.cell[n], self.faces[n], middle[n], *sides, np.asarray(ends[n, k]))
         own = np.argsort(~apart[whole], axis=1, kind="stable")[:, :3]
         three = np.take_along_axis(c[whole], own[..., None], axis=1)
         at_end = np.take_along_axis(ends[whole], own, axis=1)
