@@ -166,7 +166,9 @@ class Pieces:
         at_end = np.take_along_axis(ends[whole], own, axis=1)
         apex = np.where(at_end.any(axis=1), (at_end.argmax(axis=1) + 2) % 3, 0)[:, None]
         first, a, b = (np.take_along_axis(three, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3))
-        alone = Triangles(self.cell[whole], self.faces[whole], first, a - first, b - first, at_end.any(axis=1))
+        alone = Triangles(
+            self.cell[whole], self.faces[whole], first, a - first, b - first, np.asarray(at_end.any(axis=1))
+        )
         both = [np.concatenate([getattr(part, each.name) for part in (alone, fans)]) for each in fields(Triangles)]
         return Triangles(*both)
 
