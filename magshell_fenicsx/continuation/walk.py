@@ -358,7 +358,10 @@ class Walk:
                     shorter, why = abs(point.s - low.s) / 4, str(e)
                     break
                 if state:
-                    self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                    try:
+                        self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                    except PathStopped as e:  # nearer to the first point the change is smaller
+                        shorter, why = abs(point.s - low.s) / 4, str(e)
                     break
                 try:
                     between = self._between(low, point)

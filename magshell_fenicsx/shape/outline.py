@@ -102,6 +102,14 @@ class Outline:
         shape = self.chart(None, ANY)
         return read_msh(shape, {}).nodes if isinstance(shape, MeshFile) else None
 
+    def normal_near(self, chart: Array) -> Array:
+        """The outward unit normal (3,) at a chart (2,), or of the nearest node of a mesh file to a place (3,)."""
+        shape = self.chart(None, ANY)
+        if not isinstance(shape, MeshFile):
+            return np.asarray(self.normal(chart[None])[0])
+        nodes = read_msh(replace(shape, normals=True), {}).nodes
+        return np.asarray(normals(nodes[[np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()]])[0])
+
     def charts(self) -> Array | None:
         """Their charts (n, 2); None for a mesh file."""
         shape = self.chart(None, ANY)

@@ -121,3 +121,22 @@ def test_a_closed_loop_is_told() -> None:
         for label, point in walk:
             folds += [point.state.mu["load"]] if label == "fold" else []
     assert folds == pytest.approx([1, -1, 1, -1, 1], rel=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in")
+def test_a_renewal_that_fails_shortens_the_step() -> None:
+    """Far from the first of two points other amplitudes have no solution: nearer to it the walk goes on."""
+    refused, wild = list[float](), State(np.full(3, 1e200), {"load": 0.0})
+
+    def renew(low: Point, high: Point) -> State | None:
+        if (length := abs(high.s - low.s)) <= 0.02:
+            return None
+        refused.append(length)
+        return wild
+
+    path, start = begin(0.1, 0.2)
+    walk = Walk(path, start, Goal("points", steps=5), renew)
+    steps = [point for _, point in walk]
+    assert len(steps) == 5
+    assert refused[:2] == pytest.approx([0.1, 0.025])
+    assert np.diff([start.s, *(point.s for point in steps)]).max() <= 0.02

@@ -65,7 +65,7 @@ def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> 
     key, h, Q = f"bodies.{name}", ground.h, ground.Q
     place, _ = located(section.at, ground, key)
     chart = ground.perfect.inverse(place)
-    normal = ground.perfect.normal(chart[None])[0]
+    normal = ground.perfect.normal_near(chart)
     start = place if len(chart) == 3 else ground.drawn.embedding(chart[None])[0]
     half = float(ground.half_thickness(start[None])[0])
     placed = place_body(section, key, start, normal / np.linalg.norm(normal), half, Q, ground.R)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-import basix
 import numpy as np
 from dolfinx import fem, mesh
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
-from magshell_fenicsx.parts.touching.segments import NOBODY, Points, Segments
+from magshell_fenicsx.parts.touching.segments import Segments
 from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
@@ -75,16 +74,7 @@ def touchings(
     nodes = cells_of_all.nodes[first : first + count]
     corners = topology.index_map(0).local_to_global(topology.connectivity(2, 0).array[: 3 * count].astype(np.int32))
     cells = Cells(element, cells_of_all.nodes, cells_of_all.gathered(corners.reshape(-1, 3)))
-    X, weights = basix.make_quadrature(basix.CellType.triangle, degree)
-    table = element.tabulate(1, X)[..., 0]
     placed = whole(r0)
-    a1, a2 = np.einsum("dqk,nki->dnqi", table[1:], placed[nodes])
-    rule = Points(
-        np.repeat(first + np.arange(count), len(X)),
-        np.tile(table[0], (count, 1)),
-        (weights * np.linalg.norm(np.cross(a1, a2), axis=2)).ravel(),
-        np.full(count * len(X), NOBODY),
-    )
     local = first, count + topology.index_map(2).num_ghosts
     times, thinning = np.ones(nodes.shape), np.broadcast_to(np.asarray(thins) > 0, (local[1], 1))[:, 0]
     if thickness is not None:
@@ -112,7 +102,7 @@ def touchings(
         powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if keeps_volume.any() else None
-    segments = Segments(cells, rule, X, weights, placed, element.degree)
+    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree))
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
@@ -121,7 +111,7 @@ def touchings(
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         own_h = pair.thickness * h
-        touching = kind(pair, cells, rule, segments, allowed, own_h, placed, moved, own, local, comm, faces)
+        touching = kind(pair, cells, segments, allowed, own_h, placed, moved, own, local, comm, faces)
         deep, place = touching.deepest()
         if deep > WITHIN * own_h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)

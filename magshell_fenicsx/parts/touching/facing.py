@@ -15,6 +15,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BULGE,
     SIGNS,
+    WAYS,
     Cells,
     Longs,
     Places,
@@ -25,10 +26,13 @@ from magshell_fenicsx.parts.touching.nearest import (
 from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
+Inside = NDArray[np.bool_]
 MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
 BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
 MANY = 100_000  # pairs of a point and a cell at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
+ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
+STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 
 
@@ -53,7 +57,7 @@ class Facing:
         self,
         cells: Cells,
         rule: Points,
-        allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
+        allowed: Callable[[Longs, Longs], Inside],
         h: float,
         r0: Array,
         faces: Faces | None,
@@ -150,7 +154,7 @@ class Facing:
 
     def _facing(self, points: Points, at: Places, r: Array) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
-        has one on each side of its own surface at most."""
+        has one in each direction at most: on both sides of its own surface, and before its edge."""
         cells, number = self._cells, len(self._cells.nodes)
         keys = at.point * number + at.cell
         order = np.argsort(keys, kind="stable")
@@ -167,16 +171,43 @@ class Facing:
         at = at.of(stays)
         if not len(at.point):
             return at
-        X = points.shape[at.point] @ cells.element.points  # the shape functions are exact for them
-        (_, x), (_, t1), (_, t2) = jets(cells.element, X, r[cells.nodes[points.cell[at.point]]], 1)
+        at = at.of(np.lexsort((at.distance, at.point)))
         (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        above = np.sum(np.cross(t1, t2) * (x - y), axis=1) > 0
-        at = replace(at, side=above.astype(np.int64))
-        order = np.lexsort((at.distance, at.side, at.point))
+        off = self.x_of(points, r)[at.point] - y
+        way, numbers = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
+        rest = np.arange(len(off))
+        for number_of_way in range(WAYS - 1):
+            first = np.flatnonzero(np.diff(at.point[rest], prepend=-1))
+            nearest = np.repeat(rest[first], np.diff([*first, len(rest)]))
+            alike = np.sum(way[rest] * way[nearest], axis=1) > ALIKE
+            numbers[rest[alike]] = number_of_way
+            rest = rest[~alike]
+        at = replace(at, side=numbers)
+        order = np.lexsort((at.distance, numbers, at.point))
         at = at.of(order)
-        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
+
+    def left_to_edges(self, points: Points, at: Places, normals: Array) -> Inside:
+        """Which places (n,) do not count: those of points inside a surface that face an edge of another one, steeply.
+
+        The edge's own points are there too. Those of the face see a line, which is narrower than they are apart: it
+        would be held back where it slides over one of them. Places of one point and direction are as the nearest.
+
+        Parameters
+        ----------
+        normals
+            (cells, 3) where the cuts were made.
+        """
+        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
+        nearest = at.of(first)
+        on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
+        along = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
+        on_edge = along & (on_side & (self._cells.across[nearest.cell] < 0)).any(axis=1)
+        level = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
+        left = on_edge & (level < STEEP) & ~points.on_edge[nearest.point]
+        return np.asarray(np.repeat(left, np.diff([*first, len(at.point)])))
 
 
 def nowhere() -> Places:

@@ -34,6 +34,7 @@ ON_SIDE = 1e-12  # a barycentric coordinate that is zero
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 SIDES = np.array([[-1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])  # direction of the side opposite to each corner
 DOWN = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # derivatives of the barycentric coordinates
+WAYS = 3  # directions in which a point can face places: on both sides, and before an edge
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])  # of the squares of components in the Hessian
 
 
@@ -124,7 +125,7 @@ class Places:
     distance
         (n,).
     side
-        (n,): 1 of a point above its own surface's place, else 0.
+        (n,): places in one direction from their point have one number, less than `WAYS`; 0 that of the nearest.
     """
 
     point: Longs
@@ -288,7 +289,7 @@ def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs
 
 @dataclass(frozen=True)
 class Joined:
-    """Places of a point on one side, in neighbouring cells, as one: a fold between cells has no jump then.
+    """Places of a point in one direction, in neighbouring cells, as one: a fold between cells has no jump then.
 
     Attributes
     ----------
@@ -313,7 +314,7 @@ class Joined:
     @classmethod
     def of(cls, at: Places, blur: float) -> "Joined":
         """Of places in the order of points, sides and distances."""
-        first = np.flatnonzero(np.diff(2 * at.point + at.side, prepend=-1))
+        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
         counts = np.diff([*first, len(at.point)])
         group = np.repeat(np.arange(len(first)), counts)
         size = np.exp((at.distance[first][group] - at.distance) / blur)

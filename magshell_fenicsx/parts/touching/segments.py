@@ -12,11 +12,12 @@ need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the
 """
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 
 import basix
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.touching.nearest import BULGE, CORNERS, Cells, Longs, Places
@@ -28,6 +29,7 @@ NOTHING = 1e-12  # an area in it that is none
 LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
 SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
 CLOSE = 1e-9  # between corners that are one
+BEFORE = 1e-5  # of the height of a cell: how far the points of its edge are inside
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
 FINE = 60  # parts of a side, at whose ends the distance from a rule's points is measured
@@ -48,16 +50,55 @@ class Points:
         (n,) undeformed area over R^2.
     faces
         (n,) the cell that a point faced where the cuts were made; `NOBODY` where it faced none.
+    on_edge
+        (n,) whether it is on an edge of the surface.
     """
 
     cell: Longs
     shape: Array
     weight: Array
     faces: Longs
+    on_edge: Inside
 
     def of(self, which: Inside) -> "Points":
         """Some of them."""
-        return Points(self.cell[which], self.shape[which], self.weight[which], self.faces[which])
+        return Points(*(getattr(self, each.name)[which] for each in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Points"]) -> "Points":
+        """All of several."""
+        return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Parts of reference cells.
+
+    Attributes
+    ----------
+    cell, faces
+        (n,) their cells, and what they face.
+    first, e1, e2
+        (n, 2) a corner, and the sides from there.
+    ends
+        (n,) whether the third side is on an edge of the surface.
+    """
+
+    cell: Longs
+    faces: Longs
+    first: Array
+    e1: Array
+    e2: Array
+    ends: Inside
+
+    @property
+    def size(self) -> Array:
+        """(n,) twice their areas."""
+        return np.asarray(self.e1[:, 0] * self.e2[:, 1] - self.e1[:, 1] * self.e2[:, 0])
+
+    def of(self, which: Inside) -> "Triangles":
+        """Some of them."""
+        return Triangles(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -101,6 +142,36 @@ class Pieces:
         cell, faces = ([getattr(self, name), getattr(other, name)] for name in ("cell", "faces"))
         return Pieces(np.concatenate(cell), np.concatenate(faces), np.concatenate(corners))
 
+    def triangles(self, open_sides: Inside) -> Triangles:
+        """Those of the centroids and each side; a triangle with one side on an edge of the surface, or none, is one by
+        itself. So they do not depend on which corner is the first.
+
+        Parameters
+        ----------
+        open_sides
+            (cells, 3) whether the side opposite to each corner is on an edge.
+        """
+        c, after = self.corners, np.roll(self.corners, -1, axis=1)
+        apart = np.linalg.norm(c - after, axis=2) > CLOSE
+        on = np.abs(np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)) < CLOSE
+        ends = np.asarray(apart & (on & np.roll(on, -1, axis=1) & open_sides[self.cell][:, None]).any(axis=2))
+        whole = (apart.sum(axis=1) == 3) & (ends.sum(axis=1) <= 1)
+        middle = np.zeros((len(c), 2))
+        middle[~whole] = centroid(c[~whole])
+        n, k = np.nonzero(apart & ~whole[:, None])
+        sides = c[n, k] - middle[n], after[n, k] - middle[n]
+        fans = Triangles(self.cell[n], self.faces[n], middle[n], *sides, np.asarray(ends[n, k]))
+        own = np.argsort(~apart[whole], axis=1, kind="stable")[:, :3]
+        three = np.take_along_axis(c[whole], own[..., None], axis=1)
+        at_end = np.take_along_axis(ends[whole], own, axis=1)
+        apex = np.where(at_end.any(axis=1), (at_end.argmax(axis=1) + 2) % 3, 0)[:, None]
+        first, a, b = (np.take_along_axis(three, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3))
+        alone = Triangles(
+            self.cell[whole], self.faces[whole], first, a - first, b - first, np.asarray(at_end.any(axis=1))
+        )
+        both = [np.concatenate([getattr(part, each.name) for part in (alone, fans)]) for each in fields(Triangles)]
+        return Triangles(*both)
+
     def cut(self, a: Array, b: Array) -> "Pieces":
         """What is left of lines from a (n, 2) to b."""
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
@@ -127,6 +198,33 @@ def area(corners: Array) -> Array:
     return np.asarray(np.sum(x * np.roll(y, -1, 1) - np.roll(x, -1, 1) * y, axis=1) / 2)
 
 
+def inner_rule(degree: int) -> tuple[Array, Array]:
+    """Points in the reference triangle and weights, exact for polynomials of this degree."""
+    return basix.make_quadrature(basix.CellType.triangle, degree)  # type: ignore[no-any-return]
+
+
+def ending_rule(degree: int) -> tuple[Array, Array]:
+    """The same with points beside the side opposite to the first corner, so that an edge there has points.
+
+    On lines from that corner the points are Radau's, for the weight of their distance from it, with one `BEFORE` the
+    side: an edge often lies exactly opposite another one, where the second derivative of the gap jumps. Along the side
+    they are Gauss's, so that none is opposite a corner, where several cells meet. G. H. Golub, SIAM Review 15 (1973).
+    """
+    n = (degree + 1) // 2
+    k, last = np.arange(n + 1), 1 - 2 * BEFORE
+    a, b = 1 / ((2.0 * k + 1) * (2 * k + 3)), k * (k + 1) / (2.0 * k + 1) ** 2
+    before, there = 0.0, 1.0  # the polynomials at the last point
+    for i in range(n):
+        before, there = there, (last - a[i]) * there - b[i] * before
+    a[n] = last - b[n] * before / there
+    x, vectors = scipy.linalg.eigh_tridiagonal(a, np.sqrt(b[1:]))
+    t, by_t = (1 + x) / 2, vectors[0] ** 2 / 2
+    x, by_s = scipy.special.roots_legendre(degree // 2 + 1)
+    s = (1 + x) / 2
+    X = np.stack([np.outer(t, 1 - s), np.outer(t, s)], axis=-1)
+    return X.reshape(-1, 2), np.outer(by_t, by_s / 2).ravel()
+
+
 def covers(X: Array) -> float:
     """How far the farthest place of an equilateral triangle is from the nearest of some points, over its side."""
     lattice = np.array([(i, j) for i in range(FINE + 1) for j in range(FINE + 1 - i)]) / FINE
@@ -148,28 +246,30 @@ class Segments:
 
     Parameters
     ----------
-    rule
-        Of all cells of this rank.
-    X
-        (q, 2) of its points in the reference cell.
+    own
+        The cells of this rank.
     r0
         (nodes, 3) undeformed.
-    degree
-        Of the rule on each triangle.
+    degrees
+        Of the rule on whole cells and on large parts, and on small parts.
 
     Attributes
     ----------
+    rule
+        The points of these cells, uncut.
     within
         (cells,): no place of a cell is farther from all points of the rule.
     """
 
-    def __init__(self, cells: Cells, rule: Points, X: Array, weights: Array, r0: Array, degree: int) -> None:
-        self._cells, self._rule, self._r0 = cells, rule, r0
-        self._rules = (X, weights), basix.make_quadrature(basix.CellType.triangle, degree)
+    def __init__(self, cells: Cells, own: Longs, r0: Array, degrees: tuple[int, int]) -> None:
+        self._cells, self._r0 = cells, r0
+        self._rules = [(inner_rule(degree), ending_rule(degree)) for degree in degrees]
         self._at_corners = cells.element.tabulate(0, CORNERS)[0, :, :, 0]
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        self.within: Array = BULGE * covers(X) * sides
+        far = [covers(X) for X, _ in self._rules[0]]
+        self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(far), far[0])
+        self.rule = Points.joined(self._on(Pieces.cells(own)))
 
     def points(self, near: Places, r: Array) -> Points:
         """All points of this rank.
@@ -181,7 +281,7 @@ class Segments:
         r
             (nodes, 3) where the cuts are made.
         """
-        number, rule = len(self._cells.nodes), self._rule
+        number, rule = len(self._cells.nodes), self.rule
         if not len(near.point):
             return rule
         keys = np.unique(rule.cell[near.point] * number + near.cell)
@@ -189,33 +289,31 @@ class Segments:
         order = np.argsort(self._corners(self._r0, other).mean(axis=1) @ ALONG, kind="stable")
         one, other = one[order], other[order]
         pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
-        fans = [self._on(pieces, k) for k in range(pieces.corners.shape[1])]
-        parts = [rule.of(~np.isin(rule.cell, one)), *(each for fan in fans for each in fan)]
-        return Points(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("cell", "shape", "weight", "faces")))
+        return Points.joined([rule.of(~np.isin(rule.cell, one)), *self._on(pieces)])
 
-    def _on(self, pieces: Pieces, k: int) -> list[Points]:
-        """The points on the triangles of the centroids and the corners k and k + 1; a triangle is one by itself.
-
-        So they do not depend on which corner is the first.
-        """
-        corners, made = pieces.corners, list[Points]()
-        apart = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2) > CLOSE
-        three = apart.sum(axis=1) == 3
-        others = np.argsort(~apart, axis=1, kind="stable")[:, :3]
-        own = np.take_along_axis(corners, others[..., None], axis=1)
-        first = np.where(three[:, None], own[:, 0], centroid(corners))
-        e1, e2 = corners[:, k] - first, np.roll(corners, -1, axis=1)[:, k] - first
-        e1[three], e2[three] = (own[three, 1] - first[three], own[three, 2] - first[three]) if k == 0 else (0.0, 0.0)
-        size = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
-        large = size > 2 * LARGE
-        for (X, weights), these in zip(self._rules, (large, ~large & (size > NOTHING)), strict=True):
-            at = first[these, None] + X[:, :1] * e1[these, None] + X[:, 1:] * e2[these, None]
-            cell, faces = (np.repeat(each[these], len(X)) for each in (pieces.cell, pieces.faces))
-            table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
-            a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
-            weight = np.outer(size[these], weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
-            made.append(Points(cell, table[0], weight, faces))
+    def _on(self, pieces: Pieces) -> list[Points]:
+        """The points on pieces, by the triangles that they are cut into."""
+        made, triangles = list[Points](), pieces.triangles(self._cells.across < 0)
+        for large, of_size in ((True, self._rules[0]), (False, self._rules[1])):
+            for ends, (X, weights) in ((False, of_size[0]), (True, of_size[1])):
+                these = (triangles.size > NOTHING) & ((triangles.size > 2 * LARGE) == large) & (triangles.ends == ends)
+                made.append(self._by_rule(triangles.of(these), X, weights))
         return made
+
+    def _by_rule(self, triangles: Triangles, X: Array, weights: Array) -> Points:
+        at = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None] + X[:, 1:] * triangles.e2[:, None]
+        cell, faces = (np.repeat(each, len(X)) for each in (triangles.cell, triangles.faces))
+        table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
+        a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
+        weight = np.outer(triangles.size, weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
+        on_edge = np.outer(triangles.ends, X.sum(axis=1) > 1 - 2 * BEFORE).ravel()
+        return Points(cell, table[0], weight, faces, on_edge)
+
+    def normals(self, r: Array) -> Array:
+        """(cells, 3) of the planes through the corners."""
+        c = self._corners(r, np.arange(len(self._cells.nodes)))
+        n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
 
     def _corners(self, r: Array, cell: Longs) -> Array:
         return np.asarray(np.einsum("ck,nki->nci", self._at_corners, r[self._cells.nodes[cell]]))
@@ -244,18 +342,19 @@ class Cuts:
     def __init__(self, segments: Segments, near: Callable[[Array], Places], r0: Array) -> None:
         self._segments, self._near, self._r0 = segments, near, r0
         self._displacements = {0.0: np.zeros_like(r0)}
-        self._latest = dict[float, Points]()
+        self._latest = dict[float, tuple[Points, Array]]()
 
-    def points(self, number: float, u: Array) -> Points:
-        """Those of a number; one that is not known, as in a state from elsewhere, becomes that of u."""
+    def points(self, number: float, u: Array) -> tuple[Points, Array]:
+        """Those of a number, and the normals (cells, 3) there; one that is not known, as in a state from elsewhere,
+        becomes that of u."""
         if number not in self._latest:
             at = self._displacements.setdefault(number, np.array(u))
             self._latest = {**dict([*self._latest.items()][-1:]), number: self.at(at)}
         return self._latest[number]
 
-    def at(self, u: Array) -> Points:
+    def at(self, u: Array) -> tuple[Points, Array]:
         """Those of a displacement."""
-        return self._segments.points(self._near(u), self._r0 + u)
+        return self._segments.points(self._near(u), self._r0 + u), self._segments.normals(self._r0 + u)
 
     def numbered(self, u: Array) -> float:
         """The number of a displacement, the same for the same one."""

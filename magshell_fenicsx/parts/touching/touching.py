@@ -33,6 +33,7 @@ from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.nearest import (
     SIGNS,
+    WAYS,
     Cells,
     Joined,
     Longs,
@@ -81,10 +82,8 @@ class Touching:
 
     Parameters
     ----------
-    rule
-        Points on all cells of this rank.
     segments
-        Gives the points where cells face others.
+        Gives the points on all cells of this rank, also where these face others.
     allowed
         Whether points of cells (n,) may touch cells (n,).
     h
@@ -104,7 +103,6 @@ class Touching:
         self,
         pair: Pair,
         cells: Cells,
-        rule: Points,
         segments: Segments,
         allowed: Callable[[Longs, Longs], NDArray[np.bool_]],
         h: float,
@@ -118,6 +116,7 @@ class Touching:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
         self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
+        rule = segments.rule
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
@@ -125,7 +124,7 @@ class Touching:
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
-        self._points, self._places = rule, nowhere()
+        self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
 
     # as a term
@@ -305,24 +304,33 @@ class Touching:
     def recut(self) -> float | None:
         """The number of the present displacement, if cuts there are better than those of the state; collective.
 
-        The measure is the part of the force on points that do not face what they faced where the cuts were made.
+        The measure is the part of the force on points that do not face what they faced where the cuts were made, or
+        face an edge that was steep there and is no more, or the other way round.
         """
         u = self._now()
-        at, joined, (_, pressures, _) = self._pressed()
-        astray = self._astray(self._points, at.of(joined.first), pressures)
+        at, *_ = self._pressed()
+        now = self._segments.normals(self._r0 + u)
+        turned = self._force(self._points, at.of(self._facing.left_to_edges(self._points, at, now)))
+        turned += self._force(self._points, self._left.of(~self._facing.left_to_edges(self._points, self._left, now)))
+        astray = self._astray(self._points, at, turned)
         if astray <= ASTRAY:
             return None
-        points = self._cuts.at(u)
+        points, normals = self._cuts.at(u)
         places = self._facing.found(u, self._h, points)
-        nearest = places.of(Joined.of(places, BLUR * self._h).first)
-        pressures = penalty(self._h - nearest.distance, self.stiffness.value, SOFT * self._h)[1]
-        return self._cuts.numbered(u) if self._astray(points, nearest, pressures) < astray / 2 else None
+        counted = places.of(~self._facing.left_to_edges(points, places, normals))
+        return self._cuts.numbered(u) if self._astray(points, counted) < astray / 2 else None
 
-    def _astray(self, points: Points, at: Places, pressures: Array) -> float:
-        force = points.weight[at.point] * pressures
-        other = points.faces[at.point] != at.cell
-        whole, part = self._comm.allreduce(np.array([force.sum(), force[other].sum()]))
-        return float(part / whole) if whole else 0.0
+    def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
+        """The part of the force at points that do not face what they faced, or on what is `turned`."""
+        other = at.of(points.faces[at.point] != at.cell)
+        whole, part = self._comm.allreduce(np.array([self._force(points, at), self._force(points, other) + turned]))
+        return float(part / whole) if whole else float(part > 0)
+
+    def _force(self, points: Points, at: Places) -> float:
+        """Twice that of this rank on the nearest of some places."""
+        nearest = at.of(np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1)))
+        pressures = penalty(self._h - nearest.distance, self.stiffness.value, SOFT * self._h)[1]
+        return float(points.weight[nearest.point] @ pressures)
 
     def _near(self, u: Array) -> Places:
         """The places in all cells that may press on cells of this rank at a displacement."""
@@ -349,10 +357,12 @@ class Touching:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
         u, grown = self._now(), self._faces.value if self._faces else 0.0
-        points = self._cuts.points(self.cuts.value, u)
+        points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
-            self._points, self._grown = points, grown
-            self._places, self._at = self._facing.found(u, (1 + SAME) * self._h, points), np.array(u)
+            self._points, self._grown, self._at = points, grown, np.array(u)
+            places = self._facing.found(u, (1 + SAME) * self._h, points)
+            left = self._facing.left_to_edges(points, places, normals)
+            self._places, self._left = places.of(~left), places.of(left)
             self._joined = Joined.of(self._places, BLUR * self._h)
         joined = self._joined
         return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
