@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import all_started, magshell, read_path
+from command import all_started, read_path, started
 from conftest import CASES
 from interrupted import kill, start, wait_for_rows
 
@@ -24,13 +24,13 @@ def command(out: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_ranks_and_resume(tmp_path: Path) -> None:
+def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """1, 2 and 3: every target to 1e-9 of the largest value on the path; resumed, the same rows to the last digit.
 
     Of the contact to 1e-8, its gap over h, and its force, a small difference of two, over the load on a wall.
     """
-    assert magshell(*command(tmp_path / "1")).returncode == 0
-    for ranks in (2, 3):
+    monkeypatch.setenv("PETSC_OPTIONS", "-snes_stol 1e-11")  # a stiff contact multiplies the error of u
+    for ranks in (1, 2, 3):
         done = all_started([command(tmp_path / str(ranks))], ranks)
         assert done.returncode == 0, done.stderr
     one, *others = (read_path(tmp_path / str(ranks)) for ranks in (1, 2, 3))
@@ -47,7 +47,7 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
     wait_for_rows(run, tmp_path / "killed", 12)
     kill(run, 0)
     assert len(read_path(tmp_path / "killed")) < len(one)
-    assert magshell(*command(tmp_path / "killed"), "--resume").returncode == 0
+    assert started(*command(tmp_path / "killed"), "--resume").returncode == 0
     again = read_path(tmp_path / "killed")
     for column in ("label", *EXACT):
         assert [row[column] for row in again] == [row[column] for row in one]
