@@ -123,7 +123,7 @@ def test_no_circles() -> None:
 KNOWN_KINDS = {"OwnTerm", "Magnetisation", "Loads", "ShellModel", "MeridianModel", "SolidModel"}
 
 
-@pytest.mark.parametrize("room", ["case", "studies", "runs", "problem"])
+@pytest.mark.parametrize("room", ["case", "studies", "runs", "problem", "simulate", "output"])
 def test_no_room_asks_what_kind_a_model_is(room: str) -> None:
     asked = {
         (name, node.lineno)

@@ -48,7 +48,7 @@ def _product(model: Model) -> fem.Form:
 def weight(model: Model) -> Expr | None:
     """What multiplies the mass of a shell per area: thickness and density; a solid has the thickness in its shape."""
     factors = [] if model.thickness is None else [model.thickness[0]]
-    if isinstance(model, ShellModel) and model.made_of is not None:
+    if model.made_of is not None:
         factors.append(model.made_of[2])
     return reduce(mul, factors) if factors else None
 

@@ -118,6 +118,7 @@ class MeridianModel(Thin):
 
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
+    made_of: None = None  # of one material
     multiplicity = 1
     axes: ClassVar[list[int]] = [0, 2]
 

@@ -76,6 +76,7 @@ class SolidModel(Observed):
 
     thin: Literal[False] = False
     axisymmetric: Literal[False] = False
+    made_of: None = None  # of one material
     degree = 2
     sigma = None
 

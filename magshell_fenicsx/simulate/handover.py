@@ -223,7 +223,7 @@ def amount_of(scene: Scene, name: str, state: State) -> float:
 def _carried(old: Scene, new: Scene, bifurcation: Record, mode: Vector) -> tuple[Vector, Vector]:
     """Displacement and mode of a model in the unknowns of one with less symmetry; collective."""
     system, u = new.model.system, bifurcation.point.state.u
-    if isinstance(old.model, MeridianModel):
+    if old.model.axisymmetric:
         s, theta = _along_meridian(old, new)
         both = _revolved(old.model, s, theta, u, mode, int(bifurcation.mode.removeprefix(WAVES)))
     else:

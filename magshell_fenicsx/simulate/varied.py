@@ -23,7 +23,6 @@ from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.waves import Waves
 from magshell_fenicsx.simulate.numbers import on_mesh_of
 from magshell_fenicsx.simulate.record import Record
@@ -349,7 +348,7 @@ class Varied:
 
 def _waves(stage: Stage) -> Waves:
     model = stage.scene.model
-    assert isinstance(model, MeridianModel)
+    assert model.axisymmetric
     return model.waves
 
 

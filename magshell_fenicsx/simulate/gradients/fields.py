@@ -293,8 +293,7 @@ def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
     t, over, log = model.thickness, model.over_area(), model.kernels
     Q, comm = t.function_space, t.function_space.mesh.comm
     one = fem.Constant(Q.mesh, 1.0)
-    own = model.made_of if isinstance(model, ShellModel) else None
-    rho = 1.0 if own is None else own[2]
+    rho = 1.0 if model.made_of is None else model.made_of[2]
     area = comm.allreduce(fem.assemble_scalar(log.compile("area", over(rho * one))))
     value = comm.allreduce(fem.assemble_scalar(log.compile("mass", over(rho * t[0])))) / area
     forces = fem.Function(Q)
