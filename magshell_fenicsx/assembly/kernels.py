@@ -1,7 +1,7 @@
 """Compilation: forms by dolfinx, functions at points by ours, and the time that both take.
 
-Scenes that differ by numbers have the same forms. Within a process each is compiled or loaded once, known by the form
-that it is derived from: derivatives of another scene are neither formed nor signed again.
+Two scenes that differ only in numbers have the same forms. A process compiles each form once and keeps it under the
+signature of the form that it is derived from: for the next scene UFL neither differentiates nor signs the derivative.
 """
 
 import ctypes
@@ -14,6 +14,8 @@ import cffi
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from ufl.algorithms.analysis import has_type
+from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.platform.compiler import check_room, library
@@ -29,7 +31,7 @@ Key = tuple[str, str, int]
 
 
 @dataclass(frozen=True)
-class _Known:
+class _Shared:
     """A compiled form apart from its mesh: the places of its fields and numbers among those of what it is made from."""
 
     kernels: compat.Kernels
@@ -38,7 +40,7 @@ class _Known:
     rank: int
 
 
-_known: dict[Key, _Known] = {}
+_compiled_forms: dict[Key, _Shared] = {}
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Derived:
 
     @property
     def key(self) -> Key | None:
-        """None if it is known by nothing."""
+        """None if it cannot be shared: it is empty, has several meshes, or does not depend on `u`."""
         if not isinstance(self.of, ufl.Form) or self.of.empty() or len(self.of.ufl_domains()) != 1:
             return None
         if self.u is None:
@@ -79,30 +81,33 @@ class Derived:
     def numbers(self) -> list[fem.Constant]:
         return [*self.of.constants(), *self.factor]
 
-    def bound(self, known: _Known) -> fem.Form:
+    def bound(self, shared: _Shared) -> fem.Form:
         """The compiled form on the mesh, with the fields and numbers of this one."""
         fields, numbers = self.of.coefficients(), self.numbers
         spaces = [each.ufl_function_space() for each in self.of.arguments()]
         if self.u is not None:
-            spaces = [self.u.function_space] * known.rank
+            spaces = [self.u.function_space] * shared.rank
         of_mesh = self.of.subdomain_data()[self.of.ufl_domain()]
+        assert all(tags is data[0] for data in of_mesh.values() for tags in data)  # as dolfinx asks
         return compat.bound(
-            known.kernels,
+            shared.kernels,
             spaces,
-            [fields[i] for i in known.fields],
-            [numbers[i] for i in known.numbers],
+            [fields[i] for i in shared.fields],
+            [numbers[i] for i in shared.numbers],
             {kind: data[0] for kind, data in of_mesh.items()},
             self.of.ufl_domain().ufl_cargo(),
         )
 
-    def known(self, made: ufl.Form, compiled: fem.Form) -> _Known | None:
-        """What is kept of the compiled form; None if it has other fields or numbers."""
+    def shared(self, made: ufl.Form, compiled: fem.Form) -> _Shared | None:
+        """What is kept of the compiled form; None if it has other fields or numbers, or labels, which no other has."""
+        if has_type(self.of, Label):
+            return None
         kernels = compat.kernels_of(compiled)
         fields = [_place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())]
         numbers = [_place(each, self.numbers) for each in made.constants()]
         if None in fields or None in numbers:
             return None
-        return _Known(kernels, fields, numbers, compiled.rank)  # type: ignore[arg-type]
+        return _Shared(kernels, fields, numbers, compiled.rank)  # type: ignore[arg-type]
 
 
 def _place(one: Any, among: Iterable[Any]) -> int | None:
@@ -126,14 +131,14 @@ class KernelLog:
         if key is None:
             return self._compiled(name, form.make())
         comm, start = form.of.ufl_domain().ufl_cargo().comm, time.perf_counter()
-        if comm.allreduce(key in _known, MPI.LAND):  # ranks may have compiled others alone
-            bound = form.bound(_known[key])
+        if comm.allreduce(key in _compiled_forms, MPI.LAND):  # ranks may have compiled others alone
+            bound = form.bound(_compiled_forms[key])
             self._note(name, start)
             return bound
         made = form.make()
         compiled = self._compiled(name, made)
-        if isinstance(made, ufl.Form) and compiled is not None and (known := form.known(made, compiled)):
-            _known[key] = known
+        if isinstance(made, ufl.Form) and compiled is not None and (shared := form.shared(made, compiled)):
+            _compiled_forms[key] = shared
         return compiled
 
     def _compiled(self, name: str, expression: ufl.Form) -> fem.Form:

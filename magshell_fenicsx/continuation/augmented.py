@@ -67,9 +67,10 @@ class Locus:
     unstable
         Number of unstable directions besides `phi`.
     counts
-        The same by families: of the model, then of those of modes that it excludes, where these are looked at.
+        The same for each family: the model's own modes, then each family that it excludes; empty where these are not
+        counted.
     met
-        Where two instabilities cross the family of the other one, a place in `counts`.
+        At a crossing: index in `counts` of the family of the other bifurcation.
     way
         Tangent of the boundary, of length one.
     cubic, pull
@@ -92,6 +93,10 @@ class Locus:
     factorisations: int
     counts: Sequence[int] = ()
     met: int = 0
+
+    def unstable_of(self, family: int) -> int:
+        """The number of a family; those that are too short for the shell are not counted."""
+        return self.counts[family] if family < len(self.counts) else 0
 
 
 @dataclass(frozen=True)

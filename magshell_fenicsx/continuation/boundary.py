@@ -90,7 +90,7 @@ class Boundary:
             raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
         again = self._solved(p, state, phi, Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
         if isinstance(again, str):
-            raise BoundaryLost(f"the {self.kind} at the end of the case is not found again: {again}")
+            raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {again}")
         return replace(again, p=p)
 
     def followed(
@@ -155,11 +155,12 @@ class Boundary:
             if low.unstable != high.unstable and (met := self._meeting(low, high, length, lambda one: one.unstable)):
                 yield "meeting", met
             return
-        changed = [i for i, (a, b) in enumerate(zip(low.counts, high.counts, strict=True)) if a != b]
-        met_by = {i: self._meeting(low, high, length, partial(_count, i), i) for i in changed}
+        families = range(max(len(low.counts), len(high.counts)))
+        changed = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
+        met_by = {i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i) for i in changed}
         for i, met in sorted(met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0):
             if met:
-                yield ("crossing" if i else "meeting"), replace(met, met=i)
+                yield ("meeting" if i in (0, self.m) else "crossing"), replace(met, met=i)
 
     def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
         """The point after a step: by the cubic through the last two points and their tangents."""
@@ -416,10 +417,6 @@ def _slope(places: Sequence[float]) -> list[tuple[float, float]]:
     scale = np.abs(off).max()
     weights = np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
     return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
-
-
-def _count(family: int, locus: Locus) -> int:
-    return locus.counts[family]
 
 
 def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:

@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.augmented import Family, Row, Way
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import offset
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import State, Vector, dot
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
 SOLVES = 40  # of the inverse iteration for an eigenvalue
 AGREE = 1e-9  # relative change of the eigenvalue that ends it
@@ -40,7 +40,7 @@ class ExcludedLines:
     Attributes
     ----------
     v, g
-        See above.
+        Null vector and residual of K_m v + g b = 0.
     counts, unstable
         Numbers of unstable directions besides v, of the model and of each family, and their sum.
     pull, bend
@@ -59,11 +59,12 @@ class ExcludedLines:
         beside: Sequence[tuple[float, float]],
     ) -> None:
         self._system, self._family, self._m, self.pull, self.bend = newton.system, family, m, 0.0, 0.0
-        self._p, self._state = p, state
+        self._p, self._state, self._b = p, state, b
         system, own, u, mu = newton.system, state.mu[name], state.u, state.mu
         self._factors = newton.factor_at(state)
         self._comm = comm = system.comm
         counts = list(family.counts(p, state))
+        counts += [0] * (m - len(counts))
         of_family = family.factored(p, state, m)
         y = of_family.solve(b)
         compliance = dot(comm, b, y)
@@ -101,11 +102,17 @@ class ExcludedLines:
         return Way(-w_R - dmu * w_mu - dp * w_p, float(dmu), float(dp))
 
     def eigenvalue(self, m: int, p: float, state: State) -> float:
-        """The eigenvalue of a family's tangent that is nearest to zero; of the model's own tangent for m = 0."""
+        """The eigenvalue of a family's tangent that is nearest to zero; of the model's own tangent for m = 0.
+
+        Of the family of v the one across b.
+        """
         factors = self._family.factored(p, state, m) if m else self._factors
+        along_b = factors.solve(self._b) if m == self._m else None
         x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + self._comm.rank), np.inf
         for _ in range(SOLVES):
             y = factors.solve(x)
+            if along_b is not None:  # the bordered tangent is regular
+                y = y - dot(self._comm, self._b, y) / dot(self._comm, self._b, along_b) * along_b
             last, value = value, float(dot(self._comm, x, x) / dot(self._comm, x, y))
             if abs(value - last) <= AGREE * abs(value):
                 break
@@ -114,7 +121,7 @@ class ExcludedLines:
 
     def _by(self, w: Vector) -> float:
         """The derivative of g along a displacement."""
-        if not np.any(w):
+        if not max_abs(self._comm, w):
             return 0.0
         d, state = offset(self._system, w), self._state
         ahead, back = (

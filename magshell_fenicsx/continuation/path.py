@@ -24,7 +24,7 @@ LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
-WORSE = 2.0  # the same beside the error of the last guess
+WORSE = 2.0  # such an error, over that of the last guess
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -71,7 +71,7 @@ class _Far:
 
 
 def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
-    """What values and slopes at nodes count at `s`, on the polynomial that has them all."""
+    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial through all of them."""
     weights = []
     for i, a in enumerate(nodes):
         others = [*nodes[:i], *nodes[i + 1 :]]
@@ -235,9 +235,11 @@ class Path:
                 pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 length = min(length, self._past_fold(passed, length))
-                length *= self._foreseen(passed, here.s + np.copysign(length, way))
+                smooth = self._smooth(passed)
+                if smooth:
+                    length *= self._foreseen(passed, here.s + np.copysign(length, way))
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
-                tried = self._try(s, passed)
+                tried = self._try(s, passed[-3:] if smooth else passed[-2:])
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
                 if isinstance(tried, str):
@@ -281,18 +283,13 @@ class Path:
         turns = [float(t.real) for t in np.roots([c, b, first]) if abs(t.imag) < SEEN and t.real > 1]
         return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
 
-    def predict(self, s: float, passed: Sequence[Point]) -> State:
-        """A first guess at `s`: linear, cubic, or quintic where that would have found the last point better."""
-        return self._extended(s, passed[-3:] if self._smooth(passed) else passed[-2:])
-
     def _smooth(self, passed: Sequence[Point]) -> bool:
+        """Whether the quintic through three points would have found the last one better than the cubic through two."""
         *earlier, here = passed
         return len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
 
     def _foreseen(self, passed: Sequence[Point], s: float) -> float:
         """The part of a step to `s` whose first guess is about as good as that of the last step, or good enough."""
-        if not self._smooth(passed):
-            return 1.0
         *earlier, here = passed
         cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
@@ -334,10 +331,10 @@ class Path:
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
 
     def _try(self, s: float, passed: Sequence[Point]) -> Point | _Far | str:
-        """The next point, or one that is too far away, or the reason why there is none."""
+        """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        point = self.at(s, self.predict(s, passed), here)
+        point = self.at(s, self._extended(s, passed), here)
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):

@@ -218,8 +218,8 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4), or do so again if the eigenvalue says that more
-        is left: the order of the method is 1.44, and close to zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue says that more is left, they
+        must agree once more. The order of the method is 1.44, and close to zero the eigenvalue is only rounding.
         """
         path, side = self.path, 0
         first = critical_mode(stability, low.state)
@@ -240,7 +240,7 @@ class _Search:
                 rest = self.rest(point, stability, slope)
                 if settled or rest <= self.tolerance * abs(mu):
                     return replace(point, load_error=rest)
-                settled = True  # once more: a guess on the other side of the zero may be nearer
+                settled = True  # the next guess, from the other side, may be nearer
             if width <= self.tolerance * abs(mu):
                 return replace(point, load_error=max(width, self.rest(point, stability, slope)))
             last, mode = point.s, critical_mode(stability, point.state)

@@ -322,15 +322,15 @@ def _followed(
     def curve(m: int) -> Boundary:
         return Boundary(varied, varied.name, varied.kind, scales, own.recorded, m)
 
-    def take_all(curve: Boundary, start: Locus, way: float) -> Locus | None:
-        """The points of a mode; where another one becomes critical before it, the point with the way there."""
+    def take_all(mode: Boundary, start: Locus, sense: float) -> tuple[Locus, float] | None:
+        """Follow one mode, up to where another becomes critical first; that crossing, and its sense."""
         last = start
-        for label, locus in curve.followed(start, way, span.ends, span.steps):
+        for label, locus in mode.followed(start, sense, span.ends, span.steps):
             if last is start and label == "crossing" and locus.met == start.met:  # where it has begun
                 continue
-            take(label, locus, curve.m)
+            take(label, locus, mode.m)
             if label == "crossing" and not last.unstable:
-                return replace(locus, way=last.way)
+                return locus, locus.p - last.p
             last = locus
         return None
 
@@ -338,13 +338,14 @@ def _followed(
         mode = curve(varied.m)
         start = mode.start(value, *varied.start())
         rows.append(_row(varied, "start", start, mode.m))
-        crossing = take_all(mode, start, sense)
-        while crossing:
+        crossed = take_all(mode, start, sense)
+        while crossed:
+            crossing, onward = crossed
             before, mode = mode.m, curve(crossing.met)
             critical = varied.null_vector(crossing.p, crossing.state, mode.m)
             there = mode.start(crossing.p, crossing.state, critical)
-            there = replace(there, met=before, unstable=there.unstable - there.counts[before])
-            crossing = take_all(mode, there, crossing.way.dp)
+            there = replace(there, met=before, unstable=there.unstable - there.unstable_of(before))
+            crossed = take_all(mode, there, onward)
     except BoundaryLost as e:
         if not rows:
             raise Stopped(str(e)) from None
@@ -360,7 +361,7 @@ def _row(varied: Varied, label: Label, locus: Locus, m: int) -> dict[str, Any]:
         "kind": label if label in SPECIAL else varied.kind,
         "mode": ", ".join(f"{WAVES}{each}" for each in waves) if m else varied.mode,
         "error": float(locus.load_error),
-        "unstable": int(locus.unstable - (locus.counts[locus.met] if label == "crossing" else 0)),
+        "unstable": int(locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)),
         "factorisations": int(locus.factorisations),
     }
 

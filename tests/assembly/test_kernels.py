@@ -45,9 +45,9 @@ def _evaluated(case: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
 def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Its residual, tangent and energies are, to the last bit, those of forms that are compiled for it alone."""
     other = case | {"shell": case["shell"] | {"poisson_ratio": 0.37, "thickness": 0.013}}
-    monkeypatch.setattr(kernels, "_known", {})
+    monkeypatch.setattr(kernels, "_compiled_forms", {})
     alone = _evaluated(other)
-    monkeypatch.setattr(kernels, "_known", {})
+    monkeypatch.setattr(kernels, "_compiled_forms", {})
     first = _evaluated(case)
 
     def refused(*given: Any, **options: Any) -> None:

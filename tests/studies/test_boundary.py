@@ -343,5 +343,21 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
     assert (tmp_path / "b" / "boundary.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
+def test_the_number_of_waves_changes_with_the_thickness(tmp_path: Path) -> None:
+    """Thinner caps have more waves, and more families are counted. The boundary goes on in its sense."""
+    case = tmp_path / "cap.yaml"
+    case.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 24.5, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\nloading: {kind: pressure, until: limit}\n"
+    )
+    found = ms.boundary(case, "shell.thickness=0.0094:0.0104:2", out=tmp_path / "b")
+    keys = [row["key"] for row in found.rows]
+    assert keys == sorted(keys)
+    assert [row["mode"] for row in found.rows if row["kind"] == "crossing"] == ["m = 3, m = 4"]
+    assert (found.rows[0]["mode"], found.rows[-1]["mode"]) == ("m = 4", "m = 3")
+    assert (keys[0], keys[-1]) == (0.0094, 0.0104)
+
+
 def _numbers(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
     return [{**row, "key": float(row["key"]), "load": float(row["load"])} for row in rows]
