@@ -88,7 +88,7 @@ class Evaluated:
         return self._system._summed(part)
 
     def residual(self) -> Vector:
-        """dPi/du, and u itself where nodes are held: Newton's method removes what rounding leaves there.
+        """dPi/du, and u itself along directions in which nodes on oblique planes are held.
 
         The terms that are not numbers are noted in the system's `strange`.
         """
@@ -103,8 +103,6 @@ class Evaluated:
             parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
             noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]
             whole = np.asarray(np.sum(noisy, axis=0))
-        if not system.moving:
-            whole[system._fixed] = self._u[system._fixed]
         return whole if system.projection is None else whole + system.projection.outside(self._u)
 
     def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:

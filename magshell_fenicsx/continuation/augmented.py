@@ -71,6 +71,8 @@ class Locus:
         counted.
     met
         At a crossing: index in `counts` of the family of the other bifurcation.
+    habit
+        `Factorisation.habit` after its solve, where one system serves all p.
     way
         Tangent of the boundary, of length one.
     cubic, pull
@@ -93,6 +95,7 @@ class Locus:
     factorisations: int
     counts: Sequence[int] = ()
     met: int = 0
+    habit: int = -1
 
     def unstable_of(self, family: int) -> int:
         """The number of a family; those that are too short for the shell are not counted."""

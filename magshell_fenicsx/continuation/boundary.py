@@ -333,13 +333,18 @@ class Boundary:
 
         def by_newton() -> Locus | str:
             try:
-                return self._iterated(float(p), state, b, row, near, look=look, rough=rough)
+                solved = self._iterated(float(p), state, b, row, near, look=look, rough=rough)
             except NoSystem as e:
                 return str(e)
+            if isinstance(solved, str) or self.family.costly:
+                return solved
+            return replace(solved, habit=self.family.at(solved.p).factorisation.habit)
 
         found = self._recorded(by_newton)
         if isinstance(found, Locus):
             self._solved_at.append(found.p)
+            if not self.family.costly:
+                self.family.at(found.p).factorisation.habit = found.habit
         return found
 
     def _beside(self, p: float, *, rough: bool) -> Sequence[tuple[float, float]]:

@@ -201,19 +201,21 @@ class _Search:
             low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
         return point
 
-    def rest(self, point: Point, stability: Stability, slope: float) -> float:
+    def rest(self, point: Point, stability: Stability, slope: float, most: float) -> float:
         """How far the load is from where the eigenvalue is zero, and what rounding of the tangent hides of that.
 
         Parameters
         ----------
         slope
-            Derivative of the eigenvalue by the load.
+            Derivative of the eigenvalue by the load; zero if it is not known.
+        most
+            How far it is at most.
         """
         u = point.state.u
         sides = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], (2, u.size))  # as rounding does
         near = [u, *(u + side * np.spacing(u) for side in sides)]
         values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in near]
-        return float((abs(values[0]) + SCATTER * np.ptp(values)) / abs(slope)) if slope else np.inf
+        return float((abs(values[0]) + SCATTER * np.ptp(values)) / abs(slope)) if slope else most
 
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
@@ -221,38 +223,44 @@ class _Search:
         It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue says that more is left, they
         must agree once more. The order of the method is 1.44, and close to zero the eigenvalue is only rounding.
         """
-        path, side = self.path, 0
+        name, side, last, best = self.path.name, 0, np.inf, None
         first = critical_mode(stability, low.state)
         a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
-        agreed, last, settled = self.tolerance**0.75, np.inf, False
-        slope = (b - a) / (high.state.mu[path.name] - low.state.mu[path.name])
+        ends = (low.state.mu[name], a), (high.state.mu[name], b)  # loads and eigenvalues
         for _ in range(MOST_TRIALS):
             # the eigenvalue nearest to zero need not be the one that changes sign
             t = a / (a - b) if a * b < 0 else 0.5
             tried = self.try_at(low.s + t * (high.s - low.s), low, high)
-            between = self.middle(low, high) if isinstance(tried, str) else tried
-            if between is None:  # the path's own tangent is singular there as well
-                return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
-            point = between
-            mu = point.state.mu[path.name]
+            point = self.middle(low, high) if isinstance(tried, str) else tried
+            if point is None:  # the path's own tangent is singular there as well
+                break
+            mu = point.state.mu[name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
-            if moved <= agreed * abs(mu) and a * b < 0:
-                rest = self.rest(point, stability, slope)
-                if settled or rest <= self.tolerance * abs(mu):
-                    return replace(point, load_error=rest)
-                settled = True  # the next guess, from the other side, may be nearer
+            if moved <= self.tolerance**0.75 * abs(mu) and a * b < 0:
+                found = replace(point, load_error=self.rest(point, stability, _slope_of(*ends), width))
+                if best or found.load_error <= self.tolerance * abs(mu):
+                    return min(best or found, found, key=lambda one: one.load_error)
+                best = found  # the next guess, from the other side, may be nearer
             if width <= self.tolerance * abs(mu):
-                return replace(point, load_error=max(width, self.rest(point, stability, slope)))
+                return replace(point, load_error=max(width, self.rest(point, stability, _slope_of(*ends), width)))
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue
+                ends = ends[0], (mu, b)
                 a = a / 2 if side == 1 else a
                 side = 1
             else:
                 low, a = point, mode.eigenvalue
+                ends = (mu, a), ends[1]
                 b = b / 2 if side == -1 else b
                 side = -1
-        return point
+        return replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+
+def _slope_of(low: tuple[float, float], high: tuple[float, float]) -> float:
+    """The slope between two loads with their eigenvalues; zero if these have one sign: they are not of one mode."""
+    (a, first), (b, last) = low, high
+    return (last - first) / (b - a) if first * last < 0 and a != b else 0.0
 
 
 def _stationary(low: Point, high: Point, name: str) -> float:

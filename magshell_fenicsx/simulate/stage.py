@@ -59,8 +59,9 @@ class Stage:
         return self.device.padded(u) if self.device else u
 
     def displaced(self, x: Vector) -> Vector:
-        """A vector of the step's system with zeros for the unknown amplitudes."""
-        return self.device.padded(self.device.displacement(x)) if self.device else x
+        """A vector of the step's system with zeros for the unknown amplitudes and where nodes are held."""
+        held = self.scene.model.system.held
+        return self.device.padded(held(self.device.displacement(x))) if self.device else held(x)
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """A path of the step's system.

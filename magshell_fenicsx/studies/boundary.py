@@ -46,6 +46,7 @@ FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numb
 FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
+REACHED = 1e-6  # of the range: so close to its end a boundary is there
 SPECIAL = ("cusp", "turn", "meeting", "crossing")
 SAID = {
     "cusp": "a cusp, where two folds are born",
@@ -385,6 +386,11 @@ def _put_together(
         + (f", {row['mode']}" if row["kind"] == "crossing" else "")
         for row in special
     ]
+    stopped = [part["stopped"] for part in (down, up) if part["stopped"]]
+    reached = min(row["key"] for row in rows), max(row["key"] for row in rows)
+    for end, key in zip(sorted((span.first, span.last)), reached, strict=True):
+        if not stopped and abs(key - end) > REACHED * abs(span.last - span.first):
+            said.append(f"between {span.text(end)} and {span.text(key)} it has no points: it turns back before")
     content = {
         "case": name,
         "settings": list(settings),
@@ -399,7 +405,7 @@ def _put_together(
         "special": special,
         "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],
         "factorisations": {"run": begin["factorisations"], "boundary": sum(row["factorisations"] for row in rows)},
-        "stopped": [part["stopped"] for part in (down, up) if part["stopped"]],
+        "stopped": stopped,
     }
     return StabilityBoundary(rows, content)
 

@@ -159,7 +159,12 @@ def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[fl
 
 
 def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
-    """Places and names of the regions; beyond a boundary of several modes each has its own."""
+    """Places and names of the regions; beyond a boundary of several modes each has its own.
+
+    Where a bifurcation comes after other instabilities it divides nothing that is stable.
+    """
+    if content["kind"] != "fold":
+        rows = [row for row in rows if not row["unstable"]] or rows
     parts, whole = _by_mode(rows), _beside(rows, content, limits)
     if len(parts) < 2:
         return whole
