@@ -128,7 +128,7 @@ def case(file: Path, seed: int) -> Case:
 
 
 def push(folder: Path, seed: int, seen: Callable[[float], object] = lambda factor: None) -> Push:
-    """One push; `seen` is told how far it is."""
+    """One push; `seen` gets its progress."""
     begun, scene = time.process_time(), Scene(case(folder / "sheet.msh", seed))
     model = scene.model
     cells = model.V.dofmap.list
