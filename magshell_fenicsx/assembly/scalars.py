@@ -403,7 +403,7 @@ def flat(nodes: Nodes) -> list[int]:
 
 
 def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], ...]:
-    """Those of each kind that occur, in the order in which they were made."""
+    """The fields, constants, ... in some expressions, each kind in the order in which they were made."""
     terminals = {terminal for e in expressions for terminal in traverse_unique_terminals(e)}
     return tuple(sorted((t for t in terminals if isinstance(t, kind)), key=lambda t: t.count()) for kind in kinds)
 

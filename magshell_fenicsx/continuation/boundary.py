@@ -88,7 +88,7 @@ class Boundary:
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
         if self.family.at(p).factor_at(state).skewed:
             raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
-        again = self._solved(p, state, phi, Row(None, 0.0, 1.0, lambda u, mu, q: q - p), None)
+        again = self._solved(p, state, phi, _at(p), None)
         if isinstance(again, str):
             raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {again}")
         return replace(again, p=p)
@@ -193,7 +193,7 @@ class Boundary:
         """The next point: where it is predicted in p if systems are costly, else at a distance."""
         if not self._at_given_p(here):
             return self._at_distance(here, guess, length)
-        row = Row(None, 0.0, 1.0, lambda u, mu, p: p - guess.dp)
+        row = _at(guess.dp)
         return self._tried(here, guess, length, row, rough=True)
 
     def _at_given_p(self, here: Locus) -> bool:
@@ -221,7 +221,7 @@ class Boundary:
         """A point with the eigenvalue of a family; where families do not couple, at a given p if that is cheaper."""
         if not (self.m and self._at_given_p(base)):
             return self._at_distance(base, guess, s, look=family)
-        return self._tried(base, guess, s, Row(None, 0.0, 1.0, lambda u, mu, p: p - guess.dp), look=family, rough=True)
+        return self._tried(base, guess, s, _at(guess.dp), look=family, rough=True)
 
     def _tried(
         self, base: Locus, guess: Way, length: float, row: Row, *, look: int | None = None, rough: bool = False
@@ -248,7 +248,7 @@ class Boundary:
             low, high = (middle, high) if inside else (low, middle)
         guess = self._ahead(before, here, high)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
-        row = Row(None, 0.0, 1.0, lambda u, mu, p: p - end)
+        row = _at(end)
         guessed, rough = State(guess.du, {self.name: guess.dmu}), self._at_given_p(here)
         last = self._solved(end, guessed, here.phi, row, here, rough=rough)
         if isinstance(last, str) or last.way.dp * here.way.dp < 0 or self.inner(last.way, here.way) < MOST_TURN:
@@ -422,6 +422,11 @@ def _slope(places: Sequence[float]) -> list[tuple[float, float]]:
     scale = np.abs(off).max()
     weights = np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
     return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
+
+
+def _at(p: float) -> Row:
+    """The row of a point at a given p."""
+    return Row(None, 0.0, 1.0, lambda u, mu, q: q - p)
 
 
 def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:

@@ -235,9 +235,10 @@ class Path:
                 pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 length = min(length, self._past_fold(passed, length))
-                smooth = self._smooth(passed)
+                cubic, quintic = self._missed(passed)
+                smooth = quintic < cubic
                 if smooth:
-                    length *= self._foreseen(passed, here.s + np.copysign(length, way))
+                    length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 tried = self._try(s, passed[-3:] if smooth else passed[-2:])
                 if isinstance(tried, _Far):
@@ -283,17 +284,18 @@ class Path:
         turns = [float(t.real) for t in np.roots([c, b, first]) if abs(t.imag) < SEEN and t.real > 1]
         return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
 
-    def _smooth(self, passed: Sequence[Point]) -> bool:
-        """Whether the quintic through three points would have found the last one better than the cubic through two."""
+    def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
+        """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
         *earlier, here = passed
-        return len(passed) > 3 and self._distance(earlier[-3:], here) < self._distance(earlier[-2:], here)
+        if len(earlier) < 3:
+            return np.inf, np.inf
+        return self._distance(earlier[-2:], here), self._distance(earlier[-3:], here)
 
-    def _foreseen(self, passed: Sequence[Point], s: float) -> float:
-        """The part of a step to `s` whose first guess is about as good as that of the last step, or good enough."""
-        *earlier, here = passed
+    def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
+        """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""
         cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
-        allowed = max(GUESSED * self.system.length, WORSE * self._distance(earlier[-2:], here))
+        allowed = max(GUESSED * self.system.length, WORSE * missed)
         return min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:

@@ -185,7 +185,7 @@ class Facing:
         at = replace(at, side=numbers)
         order = np.lexsort((at.distance, numbers, at.point))
         at = at.of(order)
-        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
+        first = at.firsts
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
 
@@ -200,7 +200,7 @@ class Facing:
         normals
             (cells, 3) where the cuts were made.
         """
-        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
+        first = at.firsts
         nearest = at.of(first)
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         along = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)

@@ -135,6 +135,11 @@ class Places:
     distance: Array
     side: Longs
 
+    @property
+    def firsts(self) -> Longs:
+        """Where each point and direction begins, of places in the order of points, directions and distances."""
+        return np.flatnonzero(np.diff(WAYS * self.point + self.side, prepend=-1))
+
     def of(self, which: Any) -> "Places":
         """Some of them."""
         return Places(*(getattr(self, each.name)[which] for each in fields(self)))
@@ -314,7 +319,7 @@ class Joined:
     @classmethod
     def of(cls, at: Places, blur: float) -> "Joined":
         """Of places in the order of points, sides and distances."""
-        first = np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1))
+        first = at.firsts
         counts = np.diff([*first, len(at.point)])
         group = np.repeat(np.arange(len(first)), counts)
         size = np.exp((at.distance[first][group] - at.distance) / blur)

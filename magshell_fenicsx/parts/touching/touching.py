@@ -33,7 +33,6 @@ from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.nearest import (
     SIGNS,
-    WAYS,
     Cells,
     Joined,
     Longs,
@@ -176,7 +175,7 @@ class Touching:
         return of_forces + float(forces @ self._growth(order))
 
     def add_by_growth(self, b: Array, factor: float) -> None:
-        """Add a factor times that of its gradient; collective."""
+        """Add a factor times the gradient's derivative by the growth; collective."""
         assert self._faces
         forces = self._on_nodes(self._changed()) + self._faces.slope_by_growth(self._at, self._forces()[:, 3])
         self._add(b, factor * forces)
@@ -328,7 +327,7 @@ class Touching:
 
     def _force(self, points: Points, at: Places) -> float:
         """Twice that of this rank on the nearest of some places."""
-        nearest = at.of(np.flatnonzero(np.diff(WAYS * at.point + at.side, prepend=-1)))
+        nearest = at.of(at.firsts)
         pressures = penalty(self._h - nearest.distance, self.stiffness.value, SOFT * self._h)[1]
         return float(points.weight[nearest.point] @ pressures)
 
