@@ -24,8 +24,8 @@ from magshell_fenicsx.command import (
     print_line,
     result_option,
     typer,
-    world,
 )
+from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams
 
 app = Commands(

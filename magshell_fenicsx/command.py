@@ -15,6 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.kept import UnsafeCache
+from magshell_fenicsx.platform.processes import world
 
 _absent = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
 if _absent:
@@ -152,13 +153,6 @@ def _numbers(text: str, between: str, said: str) -> tuple[float, float]:
     except ValueError:
         raise CaseError(said) from None
     return first, second
-
-
-def world() -> Any:
-    """All ranks."""
-    from mpi4py import MPI
-
-    return MPI.COMM_WORLD
 
 
 def print_line(line: str) -> None:

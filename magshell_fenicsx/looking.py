@@ -18,9 +18,9 @@ from magshell_fenicsx.command import (
     print_line,
     refuse_lost,
     typer,
-    world,
 )
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.platform.processes import world
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from mpi4py import MPI
 from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
@@ -18,10 +17,13 @@ from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.sizes import MeshSection
 
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
 OF_SHELLS = ("shells", "shell", "boundary", "points")  # what the data of several shells make
 
 
-def opened(case: Case | Mapping[str, Any] | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Case:
+def opened(case: Case | Mapping[str, Any] | str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Case:
     """The case itself, or that of a mapping or of a file, with the same files on all ranks; collective.
 
     Raises
@@ -41,12 +43,12 @@ def opened(case: Case | Mapping[str, Any] | str | Path, comm: MPI.Comm, settings
     return with_same_files(case, comm)
 
 
-def read_together(file: str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Source:
+def read_together(file: str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Source:
     """The case file as rank 0 reads it; collective. See `read_source`."""
     return from_first(comm, lambda: read_source(Path(file), settings))
 
 
-def with_same_files(case: Case, comm: MPI.Comm) -> Case:
+def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
     """The case, whose files rank 0 reads for all ranks; collective.
 
     Raises

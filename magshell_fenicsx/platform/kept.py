@@ -11,7 +11,7 @@ import pwd
 import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -130,13 +130,17 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
     What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
     all others would wait. Forms of another folder are linked.
     """
-    _remove_what_the_killed_left(folder)
-    with os.scandir(folder) as files:  # there may be thousands
-        forms = {file.name: file for file in files if file.name.startswith(FORMS)}
-    strange = {name.split(".")[0] for name, file in forms.items() if not trusted(file)}
-    ready = (folder / name for name in forms if name.endswith(".c.cached"))
-    strange |= {file.name.split(".")[0] for file in ready if not file.with_suffix("").exists()}  # FFCx would fail
-    _remove(folder, strange)
+    with _alone(folder) as alone:
+        with os.scandir(folder) as files:  # once: there may be thousands
+            kept = {file.name: file for file in files if file.name.startswith((FORMS, COMPILING))}
+        forms = {name: file for name, file in kept.items() if name.startswith(FORMS)}
+        strange = {name.split(".")[0] for name, file in forms.items() if not trusted(file)}
+        ready = (name.removesuffix(".cached") for name in forms if name.endswith(".c.cached"))
+        lost = [source for source in ready if source not in forms and not (folder / source).exists()]
+        strange |= {source.split(".")[0] for source in lost}  # FFCx would fail
+        marks = {name: file for name, file in kept.items() if alone and name not in forms}
+        strange |= _unfinished(forms, marks) if alone else set()
+        _remove(folder, [name for name in forms if name.split(".")[0] in strange] + [*marks])
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():
             if trusted(file):
@@ -144,23 +148,29 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
                     (folder / file.name).symlink_to(file)
 
 
-def _remove_what_the_killed_left(folder: Path) -> None:
-    """Nothing goes while one of ours compiles; another program leaves no mark, and has as long as any compilation."""
-    with suppress(OSError), _held(folder, fcntl.LOCK_EX | fcntl.LOCK_NB):
-        left = [*folder.glob(f"{COMPILING}*")]
-        begun = min((mark.stat().st_mtime for mark in left), default=float("inf"))
-        late = time.time() - UNFINISHED
-        sources = [file for file in folder.glob(f"{FORMS}*.c") if not Path(f"{file}.cached").exists()]
-        written = {file.stem: file.stat().st_mtime for file in sources}
-        _remove(folder, {form for form, moment in written.items() if moment >= begun or moment < late})
-        for mark in left:
-            mark.unlink()
+@contextmanager
+def _alone(folder: Path) -> Iterator[bool]:
+    """Whether nothing of ours compiles into a folder, which is then held meanwhile."""
+    with ExitStack() as stack:
+        alone = False
+        with suppress(OSError):
+            stack.enter_context(_held(folder, fcntl.LOCK_EX | fcntl.LOCK_NB))
+            alone = True
+        yield alone
 
 
-def _remove(folder: Path, forms: set[str]) -> None:
-    for file in folder.glob(f"{FORMS}*") if forms else ():
-        if file.name.split(".")[0] in forms:
-            file.unlink(missing_ok=True)
+def _unfinished(forms: Mapping[str, "os.DirEntry[str]"], marks: Mapping[str, "os.DirEntry[str]"]) -> set[str]:
+    """Forms that killed processes left; another program leaves no mark, and has as long as any compilation."""
+    begun = min((mark.stat().st_mtime for mark in marks.values()), default=float("inf"))
+    late = time.time() - UNFINISHED
+    sources = {name: file for name, file in forms.items() if name.endswith(".c") and f"{name}.cached" not in forms}
+    written = {name.removesuffix(".c"): file.stat().st_mtime for name, file in sources.items()}
+    return {form for form, moment in written.items() if moment >= begun or moment < late}
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _candidates(usual: Path) -> Iterator[Path]:

@@ -18,13 +18,32 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from magshell_fenicsx.platform.terminal import LAUNCHERS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What a process without others has of a communicator, before it needs MPI."""
+
+    rank: int = 0
+    size: int = 1
+
+
+def world() -> Any:
+    """All ranks. A process that no launcher started has `Alone` until MPI is imported, which takes 0.1 s."""
+    if not LAUNCHERS & os.environ.keys() and "mpi4py.MPI" not in sys.modules:
+        return Alone()
+    from mpi4py import MPI
+
+    return MPI.COMM_WORLD
 
 
 @dataclass(frozen=True)

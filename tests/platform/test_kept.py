@@ -132,12 +132,11 @@ def test_a_form_begun_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (made / "libffcx_forms_left.c").touch()
     begin = threading.Thread(target=compile_one, args=(made,))
 
-    def remove(folder: Path, forms: set[str]) -> None:
-        if not begin.ident:  # the first time, under the lock
-            begin.start()
-            begin.join(0.1)
-            assert begin.is_alive()
-        removed(folder, forms)
+    def remove(folder: Path, names: list[str]) -> None:
+        begin.start()
+        begin.join(0.1)
+        assert begin.is_alive()
+        removed(folder, names)
 
     removed = kept._remove
     monkeypatch.setattr(kept, "_remove", remove)
