@@ -1,7 +1,9 @@
 """Files that stay readable after a kill, a crash or a full disk."""
 
 import json
+import math
 import os
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from errno import EFBIG, EINVAL, EISDIR
@@ -10,6 +12,8 @@ from typing import Any, BinaryIO
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.reading import open_regular, read_whole
+
+EACH = 1.0  # s between two waits for the disk: on a busy one each takes as long as a point of a small model
 
 
 class Damaged(CaseError):
@@ -106,6 +110,9 @@ def sync_folder(folder: Path) -> None:
 class AppendedFile:
     """A file that grows by complete pieces.
 
+    A killed process loses none. A failure of power loses at most those of the last moments: the disk is waited for at
+    the first piece, then every `EACH` seconds, and at the end.
+
     Parameters
     ----------
     length
@@ -117,25 +124,53 @@ class AppendedFile:
         self._stream = file.open("ab", buffering=0)
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
         self._stream.truncate(self._length)
+        self._waited = -math.inf  # when, in the time of the clock
+        self._on_disk = self._length
 
     def append(self, content: bytes, *, waits: bool = True) -> None:
-        """Add a piece and wait until it is on disk.
+        """Add a piece.
+
+        Parameters
+        ----------
+        waits
+            Whether the disk is waited for, where it is time.
 
         Raises
         ------
         OSError
-            With the file's name; the file keeps its length.
+            With the file's name; the file keeps its length, or that which was on disk.
         """
         left = memoryview(content)
         try:
             while left:
                 left = left[self._stream.write(left) :]
-            if waits:
-                os.fsync(self._stream.fileno())
+            if waits and time.monotonic() - self._waited >= EACH:
+                self._wait(self._length + len(content))
         except OSError as e:
             self._stream.truncate(self._length)
             raise OSError(e.errno, e.strerror, str(self._file)) from None
         self._length += len(content)
 
+    def _wait(self, length: int) -> None:
+        try:
+            os.fsync(self._stream.fileno())
+        except OSError:
+            self._length = self._on_disk  # pieces between are lost
+            raise
+        self._on_disk, self._waited = length, time.monotonic()
+
     def close(self) -> None:
-        self._stream.close()
+        """Close the file, whose last pieces are on disk then.
+
+        Raises
+        ------
+        OSError
+            With the file's name.
+        """
+        try:
+            if self._waited > -math.inf and self._on_disk < self._length:
+                self._wait(self._length)
+        except OSError as e:
+            raise OSError(e.errno, e.strerror, str(self._file)) from None
+        finally:
+            self._stream.close()
