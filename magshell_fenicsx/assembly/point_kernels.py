@@ -27,6 +27,7 @@ from ufl.domain import extract_domains
 from magshell_fenicsx.assembly import scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scalars import Scalars, flat, terminals_of
+from magshell_fenicsx.platform.kept import keep, recall
 
 Pair = tuple[int, int]
 Array = NDArray[np.float64]
@@ -105,18 +106,28 @@ def _kernel(
     fields, constants, labels = terminals_of(expressions, ufl.Coefficient, ufl.Constant, Label)
     translated = cache(lambda: _graph(expressions, fields, constants))
     structure = (asked, *_structures(expressions, fields, constants, labels))
-    if structure not in _KEYS:
-        _KEYS[structure] = _key(asked, *translated())
 
     def code() -> str:
         graph, nodes = translated()
         return point_code(graph, made(graph, nodes))
 
-    library = log.load(name, _KEYS[structure], code, OPTIONS, comm)
+    library = log.load(name, _key_of(structure, lambda: _key(asked, *translated())), code, OPTIONS, comm)
     return PointKernel(function_of(library), fields, constants, size)
 
 
-_KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before in this process, by its structure
+_KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before, by its structure
+
+
+def _key_of(structure: tuple[str, ...], key: Callable[[], str]) -> str:
+    """The key, from this process or one before: to translate an expression takes as long as all else of a kernel."""
+    if structure not in _KEYS:
+        depends = repr((_version(), ufl.__version__, structure))
+        name = f"magshell_key_{hashlib.sha256(depends.encode()).hexdigest()[:40]}"
+        kept = recall(name)
+        _KEYS[structure] = kept.decode() if kept else key()
+        if not kept:
+            keep(name, _KEYS[structure].encode())
+    return _KEYS[structure]
 
 
 def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str]:
