@@ -17,6 +17,7 @@ from magshell_fenicsx.continuation.walk import locate_bifurcation
 MOST_HALVINGS = 12  # of a step in which several modes of a family change; what is left counts as one
 FASTER = 2.0  # the softest mode is assumed to soften at most so many times as fast as between the last two looks
 MOST_PASSED = 4  # the most successive points without a look
+CLOSER = 3  # halvings of a step between whose ends modes may soften and recover
 ITERATIONS = 4  # inverse iterations from the last softest mode
 FIRST = 12  # inverse iterations if there is no such mode
 NEW = 0.1  # part of a general vector in the start vector, so that modes of another symmetry are found
@@ -44,6 +45,13 @@ class Step:
     def place(self, point: Point) -> float:
         """The distance of a point from the first one, in s."""
         return abs(self._path.measured_from(self._low, point).s - self._low.s)
+
+    def middle(self) -> Point | None:
+        """The point half way between the first and the last one; None if it is not found."""
+        try:
+            return self._middle(self._points[0], self._points[-1], solve=True)
+        except PathStopped:
+            return None
 
     def crossings(self, change: Change) -> Iterator[tuple[Point, int]]:
         """Each point at which a mode is neutral, and the change of the number of unstable directions there."""
@@ -99,8 +107,25 @@ class Family(Protocol):
         """Factor their tangent at a state of the model."""
 
 
+class Tangents(Protocol):
+    """Those of several families together, as numbers in which they are linear."""
+
+    def at(self, state: State) -> Vector:
+        """The numbers at a state of the model."""
+
+    def counts(self, numbers: Vector) -> Sequence[int]:
+        """Numbers of unstable directions of all families."""
+
+    def indefinite(self, numbers: Vector) -> set[int]:
+        """The places in `counts` of families whose tangents are not positive definite."""
+
+
 class Excluded(Protocol):
     """All modes that a model excludes."""
+
+    @property
+    def tangents(self) -> Tangents | None:
+        """Of several families; None if there is one, or if crossings are not located."""
 
     @property
     def families(self) -> Sequence[Family]:
@@ -131,6 +156,8 @@ class _Look:
         Numbers of unstable directions of all families.
     softest, vector
         Magnitude of the eigenvalue nearest to zero of the only family, and its mode; None if there are several.
+    numbers
+        The tangents of several families, see `Tangents`.
     """
 
     point: Point
@@ -138,6 +165,7 @@ class _Look:
     counts: tuple[int, ...]
     softest: float = np.inf
     vector: Vector | None = None
+    numbers: Vector | None = None
 
 
 class Watch:
@@ -149,6 +177,10 @@ class Watch:
     point is skipped, then at most one in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened
     faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
     get a look.
+
+    Modes of several families may soften and recover between two points. The tangents along a step are bounded by those
+    at its ends and a third one (coefficients of Bernstein of the parabola through the last three looks). Where this is
+    not positive definite, though the ends are, the point half way gets a look, and both halves are looked at alike.
 
     Parameters
     ----------
@@ -165,6 +197,7 @@ class Watch:
         self._excluded = excluded
         self._families = excluded.families if excluded else []
         self._looked: _Look | None = None
+        self._earlier: _Look | None = None  # before the last look
         self._before: tuple[int, ...] = ()
         self._u: Vector | None = None
         self._passed: list[tuple[Point, float]] = []
@@ -194,7 +227,7 @@ class Watch:
         looked = self._looked if start.state.u is self._u and not self._passed else None
         self._path, self._expand, self._last, self._u, self._along = path, expand, start, start.state.u, 0.0
         self._rate: float | None = None
-        self._may_pass, self._passed = 0, []
+        self._may_pass, self._passed, self._earlier = 0, [], None
         self._looked = replace(looked, point=start, along=0.0) if looked else None
         if look and not looked:
             self._looked = self._look(start, 0.0)
@@ -209,13 +242,17 @@ class Watch:
         look
             Whether the point must get a look.
         """
-        name, last = self._path.name, self._last.state
-        self._along += self._path.metric.norm(point.state.u - last.u, point.state.mu[name] - last.mu[name])
+        self._along += self._length(self._last, point)
         self._last, self._u = point, point.state.u
         if not look and len(self._families) == 1 and self._still_stiff:
             self._passed.append((point, self._along))
             return []
         return self._changes()
+
+    def _length(self, first: Point, second: Point) -> float:
+        """The straight distance of two points."""
+        name, (a, b) = self._path.name, (first.state, second.state)
+        return self._path.metric.norm(b.u - a.u, b.mu[name] - a.mu[name])
 
     def end(self) -> list[Crossing]:
         """Look at the last point, if it was skipped; the crossings, see `pass_to`."""
@@ -244,14 +281,46 @@ class Watch:
         looks, self._may_pass = [last], min(max(1, 2 * len(self._passed)), MOST_PASSED)
         if self._passed and (softer or changed):
             looks, self._may_pass = [*(self._look(*passed) for passed in self._passed), last], 0
-        looks = [before, *looks] if before else looks
-        self._looked, self._passed = last, []
+        looks = self._with_closer([before, *looks]) if before else looks
+        self._looked, self._passed, self._earlier = last, [], looks[-2] if len(looks) > 1 else None
         self._rate = _rate(*looks[-2:]) if len(looks) > 1 else None
         changes = [] if before else list(self._at_start(looks[0]))
         for low, high in pairwise(looks):
             if low.counts != high.counts:
                 changes += self._between(low, high)
         return changes
+
+    def _with_closer(self, looks: list[_Look]) -> list[_Look]:
+        """Some looks, with those between them where modes may soften and recover."""
+        every, earlier = looks[:1], self._earlier
+        for low, high in pairwise(looks):
+            every += [*self._closer(earlier, low, high, CLOSER), high]
+            earlier = every[-2]
+        return every
+
+    def _closer(self, earlier: _Look | None, low: _Look, high: _Look, halvings: int) -> Iterator[_Look]:
+        if not halvings or not self._may_recover(earlier, low, high):
+            return
+        point = Step(self._path, low.point, high.point).middle()
+        if point is None:
+            return
+        part, rest = (self._length(end.point, point) for end in (low, high))
+        look = self._look(point, low.along + (high.along - low.along) * part / (part + rest))
+        yield from self._closer(earlier, low, look, halvings - 1)
+        yield look
+        yield from self._closer(low, look, high, halvings - 1)
+
+    def _may_recover(self, earlier: _Look | None, low: _Look, high: _Look) -> bool:
+        """Whether a family that is stable at both ends of a step may be unstable in it, by a parabola."""
+        tangents = self._excluded.tangents if self._excluded else None
+        if not tangents or earlier is None or earlier.numbers is None or low.numbers is None or high.numbers is None:
+            return False
+        before, step = low.along - earlier.along, high.along - low.along
+        if not before or not step:
+            return False
+        slopes = (low.numbers - earlier.numbers) / before, (high.numbers - low.numbers) / step
+        between = low.numbers + step / 2 * (step * slopes[0] + before * slopes[1]) / (before + step)
+        return any(not low.counts[i] and not high.counts[i] for i in tangents.indefinite(between))
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
         """The families that are unstable at the first point, and were not so on the path before."""
@@ -276,6 +345,9 @@ class Watch:
 
     def _look(self, point: Point, along: float) -> _Look:
         state = self._expand(point.state)
+        if self._excluded and (tangents := self._excluded.tangents):
+            numbers = tangents.at(state)
+            return _Look(point, along, tuple(tangents.counts(numbers)), numbers=numbers)
         if self._excluded is None or len(self._families) != 1:
             return _Look(point, along, tuple(self._excluded.counts(state)) if self._excluded else ())
         factors = self._families[0].factor_at(state)

@@ -41,6 +41,7 @@ class UnfoldedModes:
     """
 
     families: Sequence[Family] = ()  # they are counted and not located: the turned shape is always neutral
+    tangents = None  # nor are changes of these located
 
     def __init__(self, model: "ShellModel", as_half: "Callable[[Midsurface], ShellModel]") -> None:
         self._model, self._as_half = model, as_half

@@ -112,14 +112,27 @@ class Waves:
         between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
         assembled. Only those that are not positive definite are factored for their inertia.
         """
+        return self.counts_of(self.at_nodes(state))
+
+    def at_nodes(self, state: State) -> NDArray[np.float64]:
+        """(5, entries) of the matrices at the five m."""
         of_nodes = self._system.at(state).assembled(lambda: self._entries(state, self._nodes[:3]))
-        values = np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
-        if not self._bands:
-            self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
+        return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
+
+    def counts_of(self, values: NDArray[np.float64]) -> list[int]:
+        """See `counts`, from `at_nodes`."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
+
+    def indefinite(self, values: NDArray[np.float64]) -> list[int]:
+        """The waves of matrices as `at_nodes` gives them that are not positive definite."""
+        pieces = self._pieces
+        try:
+            return self._indefinite(values)
+        finally:
+            self._pieces = pieces  # fit for states of the path
 
     def _entries(self, state: State, waves: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
         """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the system's displacement."""
@@ -150,11 +163,13 @@ class Waves:
         negative: if these are positive definite, it is so for every m of the piece. Else the piece is halved, for the
         next states too, until its waves are as few as coefficients.
         """
+        if not self._bands:
+            self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
         once, twice = self._bands
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
         definite = cache(lambda m: twice.positive(rest, self._weights[m]))
         indefinite = set[int]() if once.positive(first, np.ones(1)) else {1}
-        halved, self._pieces = self._pieces, []
+        halved, self._pieces = [*self._pieces], []
         while halved:
             piece = halved.pop()
             ends = definite(piece.first) and definite(piece.last)
@@ -266,6 +281,11 @@ class ExcludedWaves:
         """For a `Watch`: every number of waves by itself."""
         return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
+    @property
+    def tangents(self) -> "TangentsOfWaves":
+        """For a `Watch`."""
+        return TangentsOfWaves(self.waves)
+
     def counts(self, state: State) -> Sequence[int]:
         """Numbers of unstable directions of all families at a state."""
         return self.waves.counts(state)
@@ -273,3 +293,22 @@ class ExcludedWaves:
     def is_unstable(self, state: State) -> bool:
         """Whether some wave is unstable at an axisymmetric state."""
         return any(self.waves.counts(state))
+
+
+@dataclass(frozen=True)
+class TangentsOfWaves:
+    """Of all numbers of waves; a `continuation.watch.Tangents`."""
+
+    waves: Waves
+
+    def at(self, state: State) -> NDArray[np.float64]:
+        """The numbers at an axisymmetric state."""
+        return self.waves.at_nodes(state)
+
+    def counts(self, numbers: NDArray[np.float64]) -> Sequence[int]:
+        """Numbers of unstable directions for m = 1, 2, ..."""
+        return self.waves.counts_of(numbers)
+
+    def indefinite(self, numbers: NDArray[np.float64]) -> set[int]:
+        """m - 1 of those that are not positive definite."""
+        return {m - 1 for m in self.waves.indefinite(numbers)}

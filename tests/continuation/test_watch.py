@@ -15,7 +15,7 @@ from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
-from magshell_fenicsx.continuation.watch import Crossing, Family, Watch
+from magshell_fenicsx.continuation.watch import Crossing, Watch
 
 Eigenvalues = Callable[[float], list[float]]
 
@@ -44,10 +44,33 @@ class Diagonal:
 
 @dataclass
 class Several:
-    families: Sequence[Family]
+    families: Sequence[Diagonal]
 
     def counts(self, state: State) -> list[int]:
         return [family.factor_at(state).negative_pivots for family in self.families]
+
+    @property
+    def tangents(self) -> "Together | None":
+        return Together(self.families) if len(self.families) > 1 else None
+
+
+@dataclass
+class Together:
+    """Eigenvalues, as many of each family."""
+
+    families: Sequence[Diagonal]
+
+    def at(self, state: State) -> np.ndarray:
+        x = float(state.u[0])
+        for family in self.families:
+            family.looks.append(x)
+        return np.array([family.eigenvalues(x) for family in self.families])
+
+    def counts(self, numbers: np.ndarray) -> list[int]:
+        return [int((of < 0).sum()) for of in numbers]
+
+    def indefinite(self, numbers: np.ndarray) -> set[int]:
+        return {i for i, of in enumerate(numbers) if of.min() <= 0}
 
 
 def watched(
@@ -98,12 +121,25 @@ def test_several_crossings_in_one_step_come_in_their_order() -> None:
     """Two of a family, one of another between them, one that becomes stable; all families are looked at everywhere."""
     families = [
         Diagonal("a", lambda x: [0.501 - x, 0.509 - x]),
-        Diagonal("b", lambda x: [0.505 - x]),
-        Diagonal("c", lambda x: [x - 0.507]),
+        Diagonal("b", lambda x: [0.505 - x, 5.0]),
+        Diagonal("c", lambda x: [x - 0.507, 5.0]),
     ]
     found, told = watched(families, step=0.2, points=8)
     assert places(found) == [("c", 0.0, 1), ("a", 0.501, 1), ("b", 0.505, 2), ("c", 0.507, 2), ("a", 0.509, 2)]
     assert [unstable for x, unstable in told if x > 0.51] == [3] * sum(x > 0.51 for x, _ in told)
+
+
+@pytest.mark.parametrize("width", [0.03, 0.08])
+def test_what_softens_and_recovers_within_a_step(width: float) -> None:
+    """Unstable only between two points of the path, which is stable at each of them, as is another family."""
+    families = [
+        Diagonal("a", lambda x: [(x - 1) ** 2 - (width / 2) ** 2]),
+        Diagonal("b", lambda x: [1.0 - x / 10]),
+    ]
+    found, told = watched(families, step=0.4, points=8)
+    assert not any(unstable for _, unstable in told)
+    assert places(found) == [("a", 1 - width / 2, 0), ("a", 1 + width / 2, 0)]
+    assert len(families[1].looks) < 2 * len(told)
 
 
 def test_a_mode_of_another_symmetry_is_seen() -> None:

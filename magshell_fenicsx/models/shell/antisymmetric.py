@@ -65,6 +65,7 @@ class AntisymmetricModes:
     """
 
     label = "antisymmetric"
+    tangents = None  # they are one family
 
     def __init__(self, system: FiniteElementSystem) -> None:
         self.system = system

@@ -1,6 +1,7 @@
 """Paths of the meridian model against an independent axisymmetric solver (nine digits)."""
 
 import time
+from pathlib import Path as File
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_
 from magshell_fenicsx.models.shell.parameters import Force, Material
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.problem.problem import meridian_vertices
+from magshell_fenicsx.public import run
 from magshell_fenicsx.shells.meridian import MeridianModel
 
 
@@ -98,3 +100,16 @@ def test_cells_of_a_given_size() -> None:
     tiny = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=1e-9"])
     with pytest.raises(MeshError, match=r"would have .* cells, allowed 1e\+06"):
         meridian_vertices(make_problem(tiny))
+
+
+def test_waves_that_come_and_go_within_a_step() -> None:
+    """A designed remanence: the same bifurcations on the path's own steps, of up to 0.08 of the load, as at 125 loads."""
+    remanent = f"{{kind: points, file: {File(__file__).parent / 'window.csv'}, filter: 0.0667}}"
+    settings = ["magnetic.lambda_m=0.001", f"magnetic.remanent={remanent}"]
+    found = {}
+    for how in ("until: limit", "control: load, until: target, pressure: 1, points: 125"):
+        case = Case.load(CASES / "dimple_buckling.yaml", [*settings, f"loading={{kind: pressure, {how}}}"])
+        found[how] = [(p["mode"], p["p_over_pc"]) for p in run(case).limit_points if p["p_over_pc"] < 1]
+    steps, loads = found.values()
+    assert [mode for mode, _ in steps] == [mode for mode, _ in loads] == ["m = 4", "m = 5", "m = 5", "m = 4"]
+    assert [load for _, load in steps] == pytest.approx([load for _, load in loads], rel=1e-6)
