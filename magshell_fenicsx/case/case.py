@@ -1,6 +1,6 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
@@ -157,8 +157,8 @@ class Case(WithParts):
         refuse_unfit_steps(self.context)
         return self
 
-    def problem(self) -> "Problem":
-        """What will be computed.
+    def problem(self, smooth: Collection[str] = ()) -> "Problem":
+        """What will be computed; `smooth` are keys whose formulas are known to have no details between samples.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class Case(WithParts):
         """
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
-        return make_problem(self)
+        return make_problem(self, smooth=smooth)
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:

@@ -57,8 +57,12 @@ SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
 FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
 
-def make_problem(case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None = None) -> Problem:
+def make_problem(
+    case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None = None, smooth: Collection[str] = ()
+) -> Problem:
     """The problem of a case, with its user-defined energies and `terms`; its half at a plane that is `kept`, if given.
+
+    Formulas of the keys in `smooth` are known to have no details that samples do not show.
 
     Raises
     ------
@@ -86,8 +90,8 @@ def make_problem(case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None
     for section in context.abilities:
         section.refuse_unfit_values(context, sample)
     formulas = written(context)
-    narrow = [looked_at(each.formulas, drawn) for each in formulas]
-    drawn = drawn.looked_at(narrow_places(narrow)) if formulas else drawn
+    narrow = [None if each.given.key in smooth else looked_at(each.formulas, drawn) for each in formulas]
+    drawn = drawn.looked_at(narrow_places([leaves for leaves in narrow if leaves])) if formulas else drawn
     refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     energies = surface_terms(context, terms)
     parts = _left(case, drawn, energies)

@@ -2,12 +2,12 @@
 
 Values at places show a formula only there. The arithmetic of intervals shows that it has no others between them, or
 that it may have, however narrow a step or a Gaussian is. After each operation the range is also the value in
-the middle of
-the box and what the derivatives can add to it, so that it shrinks with the square of the box.
+the middle of the box and what the derivatives can add to it, so that it shrinks with the square of the box.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,8 @@ class Range:
 
     @classmethod
     def number(cls, value: Any) -> "Range":
-        return cls(np.asarray(value, dtype=np.float64), np.asarray(value, dtype=np.float64))
+        number = np.asarray(value, dtype=np.float64)
+        return cls(number, number)
 
     def holds(self, value: float) -> NDArray[np.bool_]:
         return np.asarray((self.low <= value) & (value <= self.high))
@@ -50,8 +51,7 @@ class Range:
         return Range.of(of(self.low), of(self.high))
 
     def hull(self, *values: Any) -> "Range":
-        low = np.minimum.reduce(np.broadcast_arrays(*values))
-        return Range.of(low, np.maximum.reduce(np.broadcast_arrays(*values)))
+        return Range.of(reduce(np.minimum, values), reduce(np.maximum, values))
 
     def unless(self, which: NDArray[np.bool_], low: float = -np.inf, high: float = np.inf) -> "Range":
         """With others where `which` holds."""
@@ -67,8 +67,11 @@ def _negative(a: Range) -> Range:
 
 
 def _multiply(a: Range, b: Range) -> Range:
-    products = [x * y for x in (a.low, a.high) for y in (b.low, b.high)]
-    return a.hull(*(np.where(np.isnan(p), 0.0, p) for p in products))  # zero times infinity
+    ends = [(c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b)]
+    products = [x * y for x in ends[0] for y in ends[1]]
+    if np.isnan(sum(products)).any():
+        products = [np.where(np.isnan(p), 0.0, p) for p in products]  # zero times infinity
+    return a.hull(*products)
 
 
 def _inverse(a: Range) -> Range:
@@ -89,12 +92,16 @@ def _power(a: Range, p: Range) -> Range:
         return _power_positive(Range(np.maximum(a.low, 0.0), a.high), n)
     if n < 0:
         return _inverse(_power(a, Range.number(-n)))
+    if n == 1:
+        return a
     if n % 2:
         return a.monotone(lambda x: np.power(x, n))
     return _power_positive(_absolute(a), n) if n else Range.number(np.ones_like(a.low))
 
 
 def _power_positive(a: Range, n: float) -> Range:
+    if n == 2:
+        return a.hull(np.square(a.low), np.square(a.high))
     return a.hull(np.power(a.low, n), np.power(a.high, n)) if n >= 0 else _inverse(_power_positive(a, -n))
 
 
@@ -175,8 +182,8 @@ VALUES: dict[np.ufunc, Callable[..., Range]] = {
 
 
 def _power_slopes(a: Range, p: Range) -> list[Range]:
-    less = Range(p.low - 1, p.high - 1)
-    return [_multiply(p, _power(a, less)), _multiply(_power(a, p), _log(a))]
+    by_base = _multiply(p, _power(a, Range(p.low - 1, p.high - 1)))
+    return [by_base, _multiply(_power(a, p), _log(a)) if p.low.ndim else Range.number(0.0)]  # the power is a number
 
 
 def _angle_slopes(y: Range, x: Range) -> list[Range]:

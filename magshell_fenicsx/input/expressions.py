@@ -115,13 +115,14 @@ _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
 }
 _ALLOWED = (*(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant), *_OPERATORS)
 _Step = tuple[Callable[..., Any], int] | np.float64 | str  # of a stack: a function of some values, a number, a name
+_Operation = tuple[Callable[..., Any], tuple[int, ...], tuple[int, ...]]  # of which values, and which are then not used
 
 
 @dataclass(frozen=True)
 class Read:
     """A formula as a function of x, y, z (in lengths of R)."""
 
-    steps: "list[_Step]"
+    steps: "list[_Operation | np.float64 | str]"
 
     def __call__(self, x: Array, y: Array, z: Array) -> Array:
         return np.broadcast_to(np.asarray(_evaluate(self.steps, x, y, z), dtype=np.float64), x.shape)
@@ -214,7 +215,7 @@ def with_derivatives(text: str) -> Callable[[Array], Taylor]:
     return evaluate
 
 
-def _read(text: str) -> list[_Step]:
+def _read(text: str) -> list[_Operation | np.float64 | str]:
     said = text if len(text) <= 60 else f"{text[:57]}..."
     try:
         tree = ast.parse(text, mode="eval")
@@ -237,19 +238,44 @@ def _read(text: str) -> list[_Step]:
             allowed = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
         if not allowed:
             raise ValueError(f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}")
-    return _steps(tree)
+    return _once(_steps(tree))
 
 
-def _evaluate(steps: list[_Step], x: Any, y: Any, z: Any) -> Any:
-    names, stack = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
+def _once(steps: list[_Step]) -> list[_Operation | np.float64 | str]:
+    """The steps with what is written several times computed once, as the weights of points are."""
+    numbers, stack = dict[Any, int](), list[int]()  # of each function of values, number or name
+    for step in steps:
+        key: Any = step
+        if isinstance(step, tuple):
+            function, count = step
+            key, stack[-count:] = (function, tuple(stack[-count:])), []
+        elif not isinstance(step, str):
+            key = (step.hex(),)  # 0.0 and -0.0 are not the same
+        stack.append(numbers.setdefault(key, len(numbers)))
+    last = {value: i for i, key in enumerate(numbers) if isinstance(key, tuple) and len(key) == 2 for value in key[1]}
+    made = list[_Operation | np.float64 | str]()
+    for i, key in enumerate(numbers):
+        if isinstance(key, str):
+            made.append(key)
+        elif len(key) == 1:
+            made.append(np.float64(float.fromhex(key[0])))
+        else:
+            made.append((*key, tuple(value for value in dict.fromkeys(key[1]) if last[value] == i)))
+    return made
+
+
+def _evaluate(steps: "list[_Operation | np.float64 | str]", x: Any, y: Any, z: Any) -> Any:
+    names, values = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
     with np.errstate(all="ignore"):
         for step in steps:
             if isinstance(step, tuple):
-                function, count = step
-                stack[-count:] = [function(*stack[-count:])]
+                function, of, no_more = step
+                values.append(function(*(values[i] for i in of)))
+                for i in no_more:
+                    values[i] = None
             else:
-                stack.append(names[step] if isinstance(step, str) else step)
-    return stack[0]
+                values.append(names[step] if isinstance(step, str) else step)
+    return values[-1]
 
 
 def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: Any, z: Any) -> Any:

@@ -255,9 +255,12 @@ def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Ar
 
 
 def refinements(
-    formulas: Sequence[Written], narrow: Sequence[Leaves], drawn: Outline, turn: float, h: float
+    formulas: Sequence[Written], narrow: Sequence[Leaves | None], drawn: Outline, turn: float, h: float
 ) -> list[Squares]:
-    """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
+    """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad).
+
+    `narrow` has what was seen between samples; None: there is nothing.
+    """
     Q = rotation(turn)
 
     def places(chart: Array) -> Array:
