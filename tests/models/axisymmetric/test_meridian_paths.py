@@ -103,7 +103,7 @@ def test_cells_of_a_given_size() -> None:
 
 
 def test_waves_that_come_and_go_within_a_step() -> None:
-    """A designed remanence: the same bifurcations on the path's own steps, of up to 0.08 of the load, as at 125 loads."""
+    """A designed remanence: the same bifurcations on the path's own steps, up to 0.08 of the load, as at 125 loads."""
     remanent = f"{{kind: points, file: {File(__file__).parent / 'window.csv'}, filter: 0.0667}}"
     settings = ["magnetic.lambda_m=0.001", f"magnetic.remanent={remanent}"]
     found = {}
