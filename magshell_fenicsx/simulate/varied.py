@@ -2,10 +2,12 @@
 
 A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays in one scene. Every
 other one has a scene for each value, on the same mesh in the chart; where the chart changes its size, the mesh with it.
+Of meridians these scenes share forms and kernels (`renumbered`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from math import isclose
 from typing import Literal
 
@@ -26,6 +28,7 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
 from magshell_fenicsx.simulate.numbers import on_mesh_of
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.renumbered import Renumbered
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import stage_at
 from magshell_fenicsx.simulate.stage import Stage
@@ -37,6 +40,7 @@ Again = Callable[[float], Problem]
 STEP = 1e-4  # of the range: of differences by p
 ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
 SAME = 1e-10  # relative differences of forces that are rounding
+SHARED = 1e-7  # differences of forces in shared forms, over their change by the number
 KEPT = 8  # scenes
 WAVES = "m = "
 SOLVES = 4  # inverse iterations for waves that are nearly neutral
@@ -120,6 +124,7 @@ class Varied:
         self._again, self._ends, self._record = again, ends, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}
+        self._shared: Renumbered | None = None
         self._line: tuple[float, dict[str, float], dict[str, float]] | None = None
         self._refuse_unknown(scene)
         self._origin, self.alone = scene, False
@@ -129,6 +134,8 @@ class Varied:
         self._record_value = value
         self._stages[value] = self._base = stage_at(base, self._first)
         self.alone = self._by_amplitudes_alone(value)
+        if not self.alone:
+            self._share(value)
         self._line = self._affine(value, self._aside) if self.alone else None
 
     def _affine(self, a: float, b: float) -> tuple[float, dict[str, float], dict[str, float]] | None:
@@ -168,6 +175,10 @@ class Varied:
             target = each.load.target
             if each.load.hold or (target and target[0].quantity == "conjugate"):
                 raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
+
+    @cached_property
+    def _start(self) -> tuple[State, Vector]:
+        return self.start()
 
     def start(self) -> tuple[State, Vector]:
         """The instability in the unknowns of the family, and a null vector.
@@ -290,10 +301,12 @@ class Varied:
         if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
             raise NoSystem("the symmetry of the model changes on the way: give the case symmetry: none")
         try:
-            made = Scene(moved(self._origin, new), self._origin.comm)
+            on_mesh = moved(self._origin, new)
+            if self._shared and (scene := self._shared.at(p, on_mesh)):
+                return scene
+            return Scene(on_mesh, self._origin.comm)
         except MeshError as e:
             raise NoSystem(f"there is no mesh: {e}") from None
-        return made
 
     def _state_in(self, base: Scene, p: float) -> State:
         """The record's state in the unknowns of the family, which may be in another order."""
@@ -325,21 +338,42 @@ class Varied:
         NoInfluence
             If they are the same.
         """
-        other, (state, phi), comm = self._aside, self.start(), self._origin.model.system.comm
-        own = {self.name: state.mu[self.name]}
-
-        def forces(stage: Stage, p: float) -> Vector:
-            system, mu = stage.newton.system, {**self._fixed(stage, p), **own}
-            here = State(state.u, mu)
-            along = self._times(stage, here, self.m, phi) if self.m else times_tangent(system, here, phi)
-            return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
-
-        self._stages[other] = stage = self._stage(other)
-        before, after, moved_only = forces(self._base, value), forces(stage, other), forces(self._base, other)
+        other, comm = self._aside, self._origin.model.system.comm
+        staged = (self._base, value), (self._stage(other), other), (self._base, other)
+        before, after, moved_only = (self._forces(stage, p) for stage, p in staged)
         size = max_abs(comm, before) or 1.0
         if max_abs(comm, after - before) <= SAME * size:
             raise NoInfluence("it has no influence on this instability")
         return max_abs(comm, after - moved_only) <= SAME * size
+
+    def _share(self, value: float) -> None:
+        """Take the forms of one scene for all values, if the forces of those that have a scene are then the same."""
+        shared = Renumbered.of(self._base.scene)
+        if shared is None:
+            return
+        stages, comm = self._stages, self._origin.model.system.comm
+        own = {p: self._forces(stage, p) for p, stage in stages.items()}
+        change = max(max_abs(comm, forces - own[value]) for forces in own.values())
+        self._shared, self._stages = shared, {}
+        off = [max_abs(comm, self._forces(self._stage(p), p) - forces) for p, forces in own.items()]
+        if max(off) <= SHARED * change:
+            self._base = self._stage(value)
+            return
+        shared.leave()
+        self._shared, self._stages = None, stages
+
+    def _forces(self, stage: Stage, p: float) -> Vector:
+        """At the instability, with other numbers: residual, load, and the tangent along the null vector."""
+        system, (state, phi) = stage.newton.system, self._start
+        mu = {**self._fixed(stage, p), self.name: state.mu[self.name]}
+        here = State(state.u, mu)
+        if self.m:
+            along = self._times(stage, here, self.m, phi)
+        elif stage.scene.model.axisymmetric:  # its matrices cost little, and differences are less exact
+            along = stage.newton.factor_at(here).times(phi)
+        else:
+            along = times_tangent(system, here, phi)
+        return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
 
     def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
         mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
