@@ -9,12 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import isclose
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.augmented import NoSystem
+from magshell_fenicsx.continuation.augmented import Kind, Locus, NoSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
@@ -43,6 +42,7 @@ SAME = 1e-10  # relative differences of forces that are rounding
 SHARED = 1e-7  # differences of forces in shared forms, over their change by the number
 KEPT = 8  # scenes
 WAVES = "m = "
+NO_WORK = 1e-3  # of a load along a mode, over both lengths: it is then no fold
 SOLVES = 4  # inverse iterations for waves that are nearly neutral
 
 
@@ -118,7 +118,7 @@ class Varied:
     """
 
     def __init__(self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]) -> None:
-        self.kind: Literal["fold", "bifurcation"] = "fold" if record.label == "fold" else "bifurcation"
+        self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
         self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
         self._again, self._ends, self._record = again, ends, record
@@ -196,12 +196,35 @@ class Varied:
         except NoEigenpair as e:
             raise CaseError(f"the instability has no null vector: {e}") from None
 
-    def null_vector(self, p: float, state: State, m: int) -> Vector:
-        """That of m waves at a state where these are neutral, nearly."""
+    @property
+    def excludes(self) -> bool:
+        """Whether there are waves around a meridian, which its model excludes."""
+        return self._base.scene.model.axisymmetric
+
+    def kind_of(self, m: int, at: Locus | None = None) -> Kind:
+        """What a boundary of m waves is, or of the model's own mode (m = 0) near a point."""
+        if m or (at is None or not self.m):
+            return "bifurcation" if m else self.kind
+        system, phi = self.at(at.p).system, self.mode_at(at, 0, self.m)
+        load = system.load(at.state.u, at.state.mu, self.name)
+        return "fold" if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi) else "bifurcation"
+
+    def mode_at(self, crossing: Locus, m: int, before: int) -> Vector:
+        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary `before`."""
+        if not m:
+            try:
+                return critical_mode(self.at(crossing.p), crossing.state).vector
+            except NoEigenpair as e:
+                raise NoSystem(f"the mode that becomes critical has no null vector: {e}") from None
+        return self.null_vector(crossing.p, crossing.state, m, crossing.phi if m == before else None)
+
+    def null_vector(self, p: float, state: State, m: int, beside: Vector | None = None) -> Vector:
+        """That of m waves at a state where these are neutral, nearly; across another one."""
         factors = self.factored(p, state, m)
         v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
         for _ in range(SOLVES):
             v = factors.solve(v)
+            v = v if beside is None else v - (beside @ v) / (beside @ beside) * beside
             v /= np.linalg.norm(v)
         return v
 

@@ -163,16 +163,16 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
 
     Where a bifurcation comes after other instabilities it divides nothing that is stable.
     """
-    if content["kind"] != "fold":
-        rows = [row for row in rows if not row["unstable"]] or rows
+    rows = [row for row in rows if not row["unstable"]] or rows
     parts, whole = _by_mode(rows), _beside(rows, content, limits)
     if len(parts) < 2:
         return whole
     extent, named = np.ptp([row["key"] for row in rows]), [each for each in whole if each[2] == "stable"]
     for mode, part in parts:
-        for x, y, words in _beside(part, {**content, "mode": mode}, limits)[:1]:
+        kind = next(row["kind"] for row in part if row["kind"] in ("fold", "bifurcation"))
+        for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
             narrow = np.ptp([row["key"] for row in part]) < NARROW * extent
-            named.append((x, y, mode if narrow else words))
+            named.append((x, y, mode if narrow and mode else words))
     return named
 
 
