@@ -310,7 +310,7 @@ class Boundary:
         places, mu = [each[0] for each in looked_at], self.name
         nearest, loads = looked_at[0][2], [each[2].state.mu[mu] for each in looked_at]
         p, load = interpolated(places, [each[2].p for each in looked_at], s), interpolated(places, loads, s)
-        error = abs(load - interpolated(places[:-1], loads[:-1], s))
+        error = abs(load - interpolated(places[:-1], loads[:-1], s)) + nearest.load_error
         return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
 
     def _lines(

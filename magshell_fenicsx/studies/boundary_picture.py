@@ -16,7 +16,7 @@ WORDS = {
     "cusp": "cusp",
     "turn": "turning point",
     "meeting": "second mode neutral",
-    "crossing": "two bifurcations cross",
+    "crossing": "another mode comes first",
 }
 LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 NARROW = 0.25  # of the width of the picture: a region that has no place for more than its mode
