@@ -38,10 +38,11 @@ def critical(
     BoundaryLost
         See `Boundary.followed`.
     """
+    begun_by: int | None = None  # the family of the boundary before, where this one begins at their crossing
     while True:
         last, crossing = start, None
         for label, locus in mode.followed(start, sense, ends, steps):
-            if last is start and label == "crossing" and locus.met == start.met:  # where it has begun
+            if last is start and label == "crossing" and locus.met == begun_by:
                 continue
             yield label, locus, mode
             if label == "crossing" and not last.unstable:
@@ -54,9 +55,9 @@ def critical(
         phi = null_vector(crossing, mode.m, before)
         if before and mode.m not in (0, before):  # neither equation knows of the other
             start = mode.start(crossing.p, crossing.state, phi)
-            start = replace(start, met=before, unstable=start.unstable - start.unstable_of(before))
+            start, begun_by = replace(start, unstable=start.unstable - start.unstable_of(before)), before
         else:
-            start = _beyond(mode, crossing, phi, sense, ends)
+            start, begun_by = _beyond(mode, crossing, phi, sense, ends), None
             yield "point", start, mode
 
 

@@ -29,6 +29,9 @@ def test_deeper_caps_buckle_before_they_snap(tmp_path: Path) -> None:
         assert (of_run.label, of_run.mode) == (row["kind"], row["mode"])
         assert row["load"] == pytest.approx(of_run.point.state.mu["pressure"], rel=1e-7)
         assert not row["unstable"]
+    back = ms.boundary(file, "shell.polar=17.3:17.55:1", ["shell.polar=17.55"], out=tmp_path / "back")
+    assert [row["kind"] for row in back.rows] == ["fold", *["fold"] * (len(back.rows) - 3), "crossing", "bifurcation"]
+    assert back.special[0]["key"] == pytest.approx(crossing["key"], abs=1e-6)
     assert {words for _, _, words in _regions(found.rows, found.content, (0, 1))} == {
         "stable",
         "snaps",
