@@ -19,7 +19,7 @@ WORDS = {
     "crossing": "another mode comes first",
 }
 LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-NARROW = 0.25  # of the width of the picture: a region that has no place for more than its mode
+NARROW, LOW = 0.25, 0.08  # of the width of the picture: a region that has no place for more than its mode, or for that
 Row = Mapping[str, Any]
 
 
@@ -171,8 +171,10 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
     for mode, part in parts:
         kind = next(row["kind"] for row in part if row["kind"] in ("fold", "bifurcation"))
         for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
-            narrow = np.ptp([row["key"] for row in part]) < NARROW * extent
-            named.append((x, y, mode if narrow and mode else words))
+            width = np.ptp([row["key"] for row in part]) / extent
+            outer = limits[1] if y > 0 else limits[0]
+            y = (y + outer) / 2 if width < LOW else y  # beside the names of its neighbours
+            named.append((x, y, mode if width < NARROW and mode else words))
     return named
 
 
