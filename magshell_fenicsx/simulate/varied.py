@@ -11,21 +11,20 @@ from functools import cached_property
 from math import isclose
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.augmented import Kind, Locus, NoSystem
+from magshell_fenicsx.continuation.boundary import BoundaryLost
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
-from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.numbers import alike, box_of, on_mesh_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.renumbered import Renumbered
 from magshell_fenicsx.simulate.scene import Scene
@@ -34,7 +33,6 @@ from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.steps import LOCATED
 from magshell_fenicsx.simulate.transfer import transfer
 
-Array = NDArray[np.float64]
 Again = Callable[[float], Problem]
 STEP = 1e-4  # of the range: of differences by p
 ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
@@ -210,12 +208,18 @@ class Varied:
         return "fold" if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi) else "bifurcation"
 
     def mode_at(self, crossing: Locus, m: int, before: int) -> Vector:
-        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary `before`."""
+        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary `before`.
+
+        Raises
+        ------
+        BoundaryLost
+            If there is no eigenvector.
+        """
         if not m:
             try:
                 return critical_mode(self.at(crossing.p), crossing.state).vector
             except NoEigenpair as e:
-                raise NoSystem(f"the mode that becomes critical has no null vector: {e}") from None
+                raise BoundaryLost(f"the mode that becomes critical has no null vector: {e}") from None
         return self.null_vector(crossing.p, crossing.state, m, crossing.phi if m == before else None)
 
     def null_vector(self, p: float, state: State, m: int, beside: Vector | None = None) -> Vector:
@@ -423,26 +427,12 @@ def moved(scene: Scene, new: Problem) -> Problem:
         if knots.shape != places.shape:
             raise NoSystem("a rim of a dimple appears or vanishes on the way")
         return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))
-    if scene.model.midsurface and not _alike(old.shape, new.shape):
+    if scene.model.midsurface and not alike(old.shape, new.shape):
         patch = scene.model.midsurface.reshaped(new.embedding)
-        one, two = _box(old.shape), _box(new.shape)
+        one, two = box_of(old.shape), box_of(new.shape)
         if one is None or two is None or patch.nodes.shape[1] != 2:
             raise NoSystem("the mesh of this shape cannot move with the number")
         low, size = one[0], one[1] - one[0]
         stretched = two[0] + (patch.nodes - low) / size * (two[1] - two[0])
         return replace(made, shape=replace(patch, nodes=stretched), points=new.points)
     return made
-
-
-def _alike(one: object, two: object) -> bool:
-    a, b = _box(one), _box(two)
-    return a is None or b is None or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
-
-
-def _box(shape: object) -> tuple[Array, Array] | None:
-    """Bounds of the chart."""
-    if isinstance(shape, Grid):
-        return np.array(shape.low), np.array(shape.high)
-    box: tuple[Array, Array] | None = getattr(shape, "box", None)
-    radius = getattr(shape, "radius", None)
-    return (np.zeros(2), np.full(2, radius)) if radius is not None else box
