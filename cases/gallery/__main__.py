@@ -33,6 +33,7 @@ FIRST = (
 )  # that there is
 OVER = {  # cases of magshell boundary -> the keys that vary
     "arch_boundary": ["loading.0.factor=0.5:1.9"],
+    "cap_boundary": ["shell.polar=15:28"],
     "snap_map": ["shell.defect.amplitude=0.4:2:4", "magnetic.lambda_m=-0.004:0.004:5"],
 }
 THUMB = 110  # pixels of a picture in the table at the head

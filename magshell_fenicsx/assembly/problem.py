@@ -6,6 +6,7 @@ has from its history stands in it, and goes on by `FiniteElementSystem.advance` 
 
 import itertools
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import TypeAlias
 
 import numpy as np
@@ -107,6 +108,14 @@ class FiniteElementSystem:
             self._K = fem_petsc.create_matrix(pattern.tangent_form)
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
+
+    def with_number(self, name: str, number: Settable, value: float) -> "FiniteElementSystem":
+        """The same system, all states of which have a value of a further number of its terms, in place."""
+        other = copy(self)
+        other._numbers = {name: (number, value)} | self._numbers
+        if self._assembler is None:
+            other._K = self._K.duplicate()
+        return other
 
     @property
     def dear(self) -> bool:

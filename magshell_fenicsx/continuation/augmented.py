@@ -67,8 +67,7 @@ class Locus:
     unstable
         Number of unstable directions besides `phi`.
     counts
-        The same for each family: the model's own modes, then each family that it excludes; empty where these are not
-        counted.
+        The same for each family: the model's own modes, then each family that it excludes, where these are counted.
     met
         At a crossing: index in `counts` of the family of the other bifurcation.
     habit
@@ -114,8 +113,6 @@ class Row:
 
 class Lines:
     """The rows of Newton's step at a state, with what its columns take: du = alpha v - w_R - dmu w_mu - dp w_p."""
-
-    counts: Sequence[int] = ()
 
     def __init__(
         self,

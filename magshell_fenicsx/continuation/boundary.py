@@ -11,11 +11,11 @@ from functools import partial
 from typing import Literal, cast
 
 import numpy as np
-from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way
-from magshell_fenicsx.continuation.excluded import ExcludedLines, Excluding
+from magshell_fenicsx.continuation.excluded import ExcludedLines, Excluding, nearest_eigenvalue
 from magshell_fenicsx.continuation.fold import AugmentedTangent
+from magshell_fenicsx.continuation.interpolated import interpolated, slope, stationary
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
@@ -54,6 +54,8 @@ class Boundary:
         Gets each solve, and gives its result or that of an interrupted boundary at this place.
     m
         The family of modes that the model excludes in which the bifurcation is; 0: it is one of the model itself.
+    watched
+        Whether the modes that the model excludes are counted along its own.
     """
 
     def __init__(
@@ -64,8 +66,10 @@ class Boundary:
         scales: tuple[float, float],
         recorded: "Callable[[Callable[[], Locus | str]], Locus | str]" = lambda solve: solve(),
         m: int = 0,
+        watched: bool = False,
     ) -> None:
         self.family, self.name, self.kind, self.scales, self.m = family, name, kind, scales, m
+        self._watched = watched or m > 0
         self._recorded = recorded
         self._weight = 0.0
         self._solved_at = list[float]()
@@ -151,7 +155,7 @@ class Boundary:
             turn = self._stationary(low, high, length)
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
             yield "cusp" if is_cusp else "turn", turn
-        if not self.m:
+        if not self._watched:
             if low.unstable != high.unstable and (met := self._meeting(low, high, length, lambda one: one.unstable)):
                 yield "meeting", met
             return
@@ -160,7 +164,7 @@ class Boundary:
         met_by = {i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i) for i in changed}
         for i, met in sorted(met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0):
             if met:
-                yield ("meeting" if i in (0, self.m) else "crossing"), replace(met, met=i)
+                yield ("meeting" if i == self.m == 0 else "crossing"), replace(met, met=i)
 
     def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
         """The point after a step: by the cubic through the last two points and their tangents."""
@@ -284,7 +288,7 @@ class Boundary:
         The bordered tangent may be singular there, so the point itself is interpolated between others close by; where
         families do not couple it is not, and these may be closer.
         """
-        close = CLOSE**2 if self.m else CLOSE
+        close = CLOSE if family in (0, self.m) else CLOSE**2
         looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
         s = length / 2
         for _ in range(MOST_LOOKS):
@@ -296,7 +300,7 @@ class Boundary:
             a, b = (s, b) if count(tried) == count(low) else (a, s)
             s = (a + b) / 2
             if len(looked_at) > 1:
-                ahead = _interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
+                ahead = interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
                 if abs(ahead - looked_at[0][0]) < close * length:
                     s = ahead
                     break
@@ -305,8 +309,8 @@ class Boundary:
             return looked_at[0][2] if looked_at else None
         places, mu = [each[0] for each in looked_at], self.name
         nearest, loads = looked_at[0][2], [each[2].state.mu[mu] for each in looked_at]
-        p, load = _interpolated(places, [each[2].p for each in looked_at], s), _interpolated(places, loads, s)
-        error = abs(load - _interpolated(places[:-1], loads[:-1], s))
+        p, load = interpolated(places, [each[2].p for each in looked_at], s), interpolated(places, loads, s)
+        error = abs(load - interpolated(places[:-1], loads[:-1], s)) + nearest.load_error
         return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
 
     def _lines(
@@ -317,6 +321,19 @@ class Boundary:
             return ExcludedLines(newton, state, self.name, b, self.m, cast(Excluding, self.family), p, beside)
         tangent = AugmentedTangent(newton, state, b)
         return Lines(self.kind, newton.system, state, self.name, tangent, self.family, p, beside, self.scales)
+
+    def _counts(self, lines: Lines | ExcludedLines, p: float, state: State) -> Sequence[int]:
+        """See `Locus`."""
+        if isinstance(lines, ExcludedLines):
+            return lines.counts()
+        excluded = cast(Excluding, self.family).counts(p, state) if self._watched else ()
+        return [lines.unstable, *excluded]
+
+    def _eigenvalue(self, lines: Lines | ExcludedLines, family: int, p: float, state: State) -> float:
+        """The second one of a family."""
+        if family and not self.m:
+            return nearest_eigenvalue(cast(Excluding, self.family).factored(p, state, family), self._comm)
+        return lines.eigenvalue(family, p, state)
 
     def _solved(
         self,
@@ -353,7 +370,7 @@ class Boundary:
         for q in reversed(self._solved_at):
             if min(abs(q - place) for place in places) > APART * self.scales[1] and len(places) <= LAST:
                 places.append(q)
-        return _slope(places) if rough and len(places) > LAST else self.family.beside(p, rough=rough)
+        return slope(places) if rough and len(places) > LAST else self.family.beside(p, rough=rough)
 
     def _iterated(
         self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: int | None, rough: bool
@@ -401,37 +418,25 @@ class Boundary:
             norm = -norm
         scale = dot(system.comm, lines.v, v)
         state = State(u, {**self.family.amplitudes(p), name: mu})
+        counts = self._counts(lines, p, state)
         return Locus(
             p=p,
             state=state,
             phi=np.asarray(v),
-            unstable=lines.unstable,
-            counts=lines.counts,
+            unstable=sum(counts),
+            counts=counts,
             way=Way(direction.du / norm, direction.dmu / norm, direction.dp / norm),
             cubic=lines.bend / scale**3,
             pull=lines.pull / scale,
-            second=np.nan if look is None else lines.eigenvalue(look, p, state),
+            second=np.nan if look is None else self._eigenvalue(lines, look, p, state),
             load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
             factorisations=len(sizes),
         )
 
 
-def _slope(places: Sequence[float]) -> list[tuple[float, float]]:
-    """Weights and places of the slope at the first place of the polynomial through all."""
-    off = np.array(places) - places[0]
-    scale = np.abs(off).max()
-    weights = np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
-    return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
-
-
 def _at(p: float) -> Row:
     """The row of a point at a given p."""
     return Row(None, 0.0, 1.0, lambda u, mu, q: q - p)
-
-
-def _interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
-    """The polynomial through some points."""
-    return float(barycentric_interpolate(x, y, at))
 
 
 def _turned(locus: Locus) -> Locus:
@@ -441,10 +446,5 @@ def _turned(locus: Locus) -> Locus:
 
 def _zero_of_slope(a: float, low: Locus, b: float, high: Locus, base: Locus, boundary: Boundary) -> float:
     """Where the Hermite cubic of p over the distance along the base's tangent is stationary."""
-    L = b - a
     d0, d1 = (one.way.dp / boundary.inner(base.way, one.way) for one in (low, high))
-    rise = (high.p - low.p) / L
-    roots = np.roots([3 * (d0 + d1 - 2 * rise), 2 * (3 * rise - 2 * d0 - d1), d0])
-    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
-    t = inside[0] if inside else d0 / (d0 - d1)
-    return a + L * min(max(t, 1e-3), 1 - 1e-3)
+    return a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
+from mpi4py import MPI
 
 from magshell_fenicsx.continuation.augmented import Family, Row, Way
 from magshell_fenicsx.continuation.factor import Factorisation
@@ -41,8 +42,6 @@ class ExcludedLines:
     ----------
     v, g
         Null vector and residual of K_m v + g b = 0.
-    counts, unstable
-        Numbers of unstable directions besides v, of the model and of each family, and their sum.
     pull, bend
         Of `Locus`; there is no work along v.
     """
@@ -63,16 +62,12 @@ class ExcludedLines:
         system, own, u, mu = newton.system, state.mu[name], state.u, state.mu
         self._factors = newton.factor_at(state)
         self._comm = comm = system.comm
-        counts = list(family.counts(p, state))
-        counts += [0] * (m - len(counts))
         of_family = family.factored(p, state, m)
         y = of_family.solve(b)
         compliance = dot(comm, b, y)
         self.v: Vector = np.asarray(y / compliance)
         self.g = -1 / compliance
-        counts[m - 1] = of_family.negative_pivots - (compliance < 0)
-        self.counts = [self._factors.negative_pivots, *counts]
-        self.unstable = sum(self.counts)
+        self._besides = of_family.negative_pivots - (compliance < 0)
         R_p, K_p = 0.0 * u, 0.0
         for weight, q in beside:
             there = State(u, {**family.amplitudes(q), name: own})
@@ -84,6 +79,13 @@ class ExcludedLines:
         ahead, back = (family.along(p, State(u, {**mu, name: own + step}), m, self.v) for step in (d, -d))
         self._g_mu, self._g_p = -(ahead - back) / (2 * d) - self._by(self._w_mu), -K_p - self._by(self._w_p)
         self.balance(system.residual(u, mu))
+
+    def counts(self) -> list[int]:
+        """Numbers of unstable directions besides v, of the model and of each family."""
+        m, counts = self._m, list(self._family.counts(self._p, self._state))
+        counts += [0] * (m - len(counts))
+        counts[m - 1] = self._besides
+        return [self._factors.negative_pivots, *counts]
 
     def balance(self, residual: Vector) -> None:
         """Take the residual at a state close by, with the same factors."""
@@ -107,17 +109,7 @@ class ExcludedLines:
         Of the family of v the one across b.
         """
         factors = self._family.factored(p, state, m) if m else self._factors
-        along_b = factors.solve(self._b) if m == self._m else None
-        x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + self._comm.rank), np.inf
-        for _ in range(SOLVES):
-            y = factors.solve(x)
-            if along_b is not None:  # the bordered tangent is regular
-                y = y - dot(self._comm, self._b, y) / dot(self._comm, self._b, along_b) * along_b
-            last, value = value, float(dot(self._comm, x, x) / dot(self._comm, x, y))
-            if abs(value - last) <= AGREE * abs(value):
-                break
-            x = y / np.sqrt(dot(self._comm, y, y))
-        return value
+        return nearest_eigenvalue(factors, self._comm, self._b if m == self._m else None)
 
     def _by(self, w: Vector) -> float:
         """The derivative of g along a displacement."""
@@ -128,3 +120,18 @@ class ExcludedLines:
             self._family.along(self._p, State(state.u + step * w, state.mu), self._m, self.v) for step in (d, -d)
         )
         return -(ahead - back) / (2 * d)
+
+
+def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, across: Vector | None = None) -> float:
+    """The eigenvalue nearest to zero of a matrix, of those across a vector."""
+    along = None if across is None else factors.solve(across)
+    x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf
+    for _ in range(SOLVES):
+        y = factors.solve(x)
+        if across is not None and along is not None:  # the bordered tangent is regular
+            y = y - dot(comm, across, y) / dot(comm, across, along) * along
+        last, value = value, float(dot(comm, x, x) / dot(comm, x, y))
+        if abs(value - last) <= AGREE * abs(value):
+            break
+        x = y / np.sqrt(dot(comm, y, y))
+    return value

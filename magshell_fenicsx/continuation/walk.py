@@ -220,8 +220,8 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue says that more is left, they
-        must agree once more. The order of the method is 1.44, and close to zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue says that more is left, it goes
+        on as long as that shrinks. The order of the method is 1.44, and close to zero the eigenvalue is only rounding.
         """
         name, side, last, best = self.path.name, 0, np.inf, None
         first = critical_mode(stability, low.state)
@@ -238,7 +238,8 @@ class _Search:
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= self.tolerance**0.75 * abs(mu) and a * b < 0:
                 found = replace(point, load_error=self.rest(point, stability, _slope_of(*ends), width))
-                if best or found.load_error <= self.tolerance * abs(mu):
+                stalled = best and found.load_error > best.load_error / 2
+                if stalled or found.load_error <= self.tolerance * abs(mu):
                     return min(best or found, found, key=lambda one: one.load_error)
                 best = found  # the next guess, from the other side, may be nearer
             if width <= self.tolerance * abs(mu):

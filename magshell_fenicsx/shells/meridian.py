@@ -5,6 +5,7 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import ClassVar, Literal
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Lid, Pressed
-from magshell_fenicsx.assembly.parameters import Growing, Parameter, make_parameters
+from magshell_fenicsx.assembly.parameters import Growing, Parameter, Settable, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
@@ -35,7 +36,7 @@ from magshell_fenicsx.parts.supports.supports import held_on
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
-from magshell_fenicsx.shells.waves import ExcludedWaves, Waves
+from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
 
 Array = NDArray[np.float64]
 
@@ -101,6 +102,8 @@ class MeridianModel(Thin):
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
         What multiplies the thickness, the same along every meridian; None for 1.
+    assembled
+        False for what is asked for its `numbers` alone: it has no system.
 
     Attributes
     ----------
@@ -131,6 +134,8 @@ class MeridianModel(Thin):
         loads: Loads,
         sigma: float | None = None,
         thickness: Thickness | None = None,
+        *,
+        assembled: bool = True,
     ) -> None:
         self.meridian, self.material, self.degree = meridian, material, degree
         self.conditions = conditions
@@ -166,8 +171,6 @@ class MeridianModel(Thin):
             self.energies += factory.magnetic(loads.magnetic)
         free_ends, self.without_potential = meridian_openings(meridian, conditions)
         closed = enclosed(loads, free_ends, self.without_potential)
-        swept = loads.pressure or closed
-        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += self.own_and_contacts(meridian.ends)
@@ -179,6 +182,14 @@ class MeridianModel(Thin):
                 energy, self.load_size[name] = dead_loads(name, dead, around, self.kernels)
                 self.energies.append(energy)
             self.energies += factory.dead_energies(name, dead, meridian.ends)
+        if assembled:
+            self._assemble(closed)
+
+    def _assemble(self, closed: bool) -> None:
+        """Make the system; `closed`: of openings that a pressure closes."""
+        factory, meridian, loads, V = self.factory, self.meridian, self.loads, self.V
+        swept = loads.pressure or closed
+        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters: dict[str, Parameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
@@ -189,11 +200,32 @@ class MeridianModel(Thin):
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
         self.system = FiniteElementSystem(
-            self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves, history=stiffnesses
+            self.u, terms, held, pattern, self.material.h, parameters=parameters, moving=moves, history=stiffnesses
         )
         self._volume = self.kernels.compile("volume energy", volume)
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
+
+    def numbers(self) -> dict[str, list[Array]] | None:
+        """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
+        follows = self.growing or self.contacts or self.fields or self.loads.moves
+        if follows or any(e.density is None or e.counted for e in self.energies):
+            return None
+        free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
+        values = {"placement": [self.r0.x.array]}
+        for e in self.energies:
+            assert e.density
+            parameters = [p for p in e.density.parameters if id(p) not in free]
+            values[e.name] = [p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters]
+        return values
+
+    def with_numbers(self, of: "MeridianModel", numbers: Settable, value: float) -> "MeridianModel":
+        """The same model with the numbers of another one, which all evaluations put in place by that value."""
+        other = copy(self)
+        other.system = self.system.with_number("numbers of the case", numbers, value)
+        other.meridian, other.material = of.meridian, of.material
+        other.excluded_modes = ExcludedWaves(self.waves.of(other.system, most_waves(of.meridian, of.material.h)))
+        return other
 
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:

@@ -6,6 +6,7 @@ cosine's and of the sine's coefficients: one form on the meridian with m as a nu
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import ceil, comb, sqrt
@@ -64,21 +65,34 @@ class Waves:
         supports: Supports,
         log: KernelLog,
     ) -> None:
-        self._system = system
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
-        self.largest = ceil(2.2 * meridian.reach * sqrt(meridian.curvature / system.length)) + 5
         self._m = fem.Constant(V.mesh, 1.0)
         self._kept = [e for e in energies if not e.linear]
         self._points = WavePoints(carrier, system.u, self._kept, log)
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
-        self._nodes = self.largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
-        self._weights = _lagrange(self._nodes, np.arange(self.largest + 1))
-        self._pieces = [_Piece(2, self.largest, self._nodes)]
-        self._matrices = dict[str, PETSc.Mat]()
-        self._bands: list[Banded] = []
-        self._factorisation, self._counting = Factorisation(V.mesh.comm), Factorisation(V.mesh.comm)
+        self._look_at(most_waves(meridian, system.length))
+        self._solve_for(system)
+
+    def _look_at(self, largest: int) -> None:
+        self.largest = largest
+        self._nodes = largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
+        self._weights = _lagrange(self._nodes, np.arange(largest + 1))
+        self._pieces = [_Piece(2, largest, self._nodes)]
+
+    def _solve_for(self, system: FiniteElementSystem) -> None:
+        self._system, self._matrices = system, dict[str, PETSc.Mat]()
+        self._factorisation, self._counting = (Factorisation(self.V.mesh.comm) for _ in range(2))
+
+    def of(self, system: FiniteElementSystem, largest: int) -> "Waves":
+        """Those of another system with the same terms."""
+        _ = self._bands, self._rows_of_matrix  # both have these
+        other = copy(self)
+        other._solve_for(system)
+        if largest != self.largest:
+            other._look_at(largest)
+        return other
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
@@ -140,6 +154,11 @@ class Waves:
         return self._points.entries(factors, [float(m) for m in waves])
 
     @cached_property
+    def _bands(self) -> list[Banded]:
+        """Of m = 1, and of all others."""
+        return [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
+
+    @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns of these entries: those of one triangle, and all of the nodes' own blocks."""
         rows, columns = (
@@ -163,13 +182,11 @@ class Waves:
         negative: if these are positive definite, it is so for every m of the piece. Else the piece is halved, for the
         next states too, until its waves are as few as coefficients.
         """
-        if not self._bands:
-            self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
         once, twice = self._bands
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
         definite = cache(lambda m: twice.positive(rest, self._weights[m]))
         indefinite = set[int]() if once.positive(first, np.ones(1)) else {1}
-        halved, self._pieces = [*self._pieces], []
+        halved, self._pieces = [*self._pieces], []  # of others of the same terms too
         while halved:
             piece = halved.pop()
             ends = definite(piece.first) and definite(piece.last)
@@ -216,6 +233,11 @@ class Waves:
         v, u = fem.Function(self.V), carriers.revolved(self._system.u)
         cosine, sine = carriers.wave(v, self._m)
         return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
+
+
+def most_waves(meridian: Meridian, length: float) -> int:
+    """See `Waves.largest`."""
+    return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
 class _Piece:

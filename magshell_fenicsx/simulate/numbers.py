@@ -9,16 +9,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import is_length
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.problem.wanted import FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
+Array = NDArray[np.float64]
 OF_MATERIAL = (
     "alpha",
     "density",
@@ -197,3 +200,18 @@ def goals(old: Scene, new: Scene, quantity: str, steps: int | None = None) -> di
         if one and two and one[0].quantity == quantity and one[1] and one[1] != two[1]:
             targets[before.name] = two[1] / one[1]
     return targets
+
+
+def alike(one: object, two: object) -> bool:
+    """Whether two shapes have the same bounds of their charts, as far as these are known."""
+    a, b = box_of(one), box_of(two)
+    return a is None or b is None or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
+
+
+def box_of(shape: object) -> tuple[Array, Array] | None:
+    """Bounds of the chart of a shape; None if they are not known."""
+    if isinstance(shape, Grid):
+        return np.array(shape.low), np.array(shape.high)
+    box: tuple[Array, Array] | None = getattr(shape, "box", None)
+    radius = getattr(shape, "radius", None)
+    return (np.zeros(2), np.full(2, radius)) if radius is not None else box

@@ -64,8 +64,8 @@ def build_model(problem: Problem, comm: MPI.Comm) -> ShellModel:
     return model
 
 
-def build_meridian_model(problem: Problem) -> MeridianModel:
-    """The meridian, whole on every rank."""
+def build_meridian_model(problem: Problem, *, assembled: bool = True) -> MeridianModel:
+    """The meridian, whole on every rank; `assembled` as of the model."""
     span = problem.meridian
     assert span
     points = {name: span.place(x) for name, x in problem.points.items()}
@@ -79,6 +79,7 @@ def build_meridian_model(problem: Problem) -> MeridianModel:
         problem.loads,
         problem.mesh.penalty,
         problem.thickness,
+        assembled=assembled,
     )
 
 
@@ -155,11 +156,17 @@ class Scene:
 
     def retuned(self, context: Context) -> "Scene":
         """The same model and solver for what differs by the strength of the field alone."""
+        return self._with(problem=replace(self.problem, context=context, lambda_m=strength(context)))
+
+    def renumbered(self, problem: Problem, model: MeridianModel) -> "Scene":
+        """The same for a problem that differs in numbers, with the model that has these."""
+        return self._with(problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options))
+
+    def _with(self, **others: Any) -> "Scene":
         other = object.__new__(Scene)
         # what is cached is computed anew
         attributes = {name: of for name, of in vars(self).items() if name not in vars(Scene)}
-        problem = replace(self.problem, context=context, lambda_m=strength(context))
-        vars(other).update(attributes, problem=problem)
+        vars(other).update(attributes | others)
         return other
 
     @property

@@ -2,43 +2,45 @@
 
 A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays in one scene. Every
 other one has a scene for each value, on the same mesh in the chart; where the chart changes its size, the mesh with it.
+Of meridians these scenes share forms and kernels (`renumbered`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from math import isclose
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.augmented import NoSystem
+from magshell_fenicsx.continuation.augmented import Kind, Locus, NoSystem
+from magshell_fenicsx.continuation.boundary import BoundaryLost
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import times_tangent
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
-from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.numbers import alike, box_of, on_mesh_of
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.renumbered import Renumbered
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import stage_at
 from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.steps import LOCATED
 from magshell_fenicsx.simulate.transfer import transfer
 
-Array = NDArray[np.float64]
 Again = Callable[[float], Problem]
 STEP = 1e-4  # of the range: of differences by p
 ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
 SAME = 1e-10  # relative differences of forces that are rounding
+SHARED = 1e-7  # differences of forces in shared forms, over their change by the number
 KEPT = 8  # scenes
 WAVES = "m = "
+NO_WORK = 1e-3  # of a load along a mode, over both lengths: it is then no fold
 SOLVES = 4  # inverse iterations for waves that are nearly neutral
 
 
@@ -114,12 +116,13 @@ class Varied:
     """
 
     def __init__(self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]) -> None:
-        self.kind: Literal["fold", "bifurcation"] = "fold" if record.label == "fold" else "bifurcation"
+        self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
         self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
         self._again, self._ends, self._record = again, ends, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}
+        self._shared: Renumbered | None = None
         self._line: tuple[float, dict[str, float], dict[str, float]] | None = None
         self._refuse_unknown(scene)
         self._origin, self.alone = scene, False
@@ -129,6 +132,8 @@ class Varied:
         self._record_value = value
         self._stages[value] = self._base = stage_at(base, self._first)
         self.alone = self._by_amplitudes_alone(value)
+        if not self.alone:
+            self._share(value)
         self._line = self._affine(value, self._aside) if self.alone else None
 
     def _affine(self, a: float, b: float) -> tuple[float, dict[str, float], dict[str, float]] | None:
@@ -169,6 +174,10 @@ class Varied:
             if each.load.hold or (target and target[0].quantity == "conjugate"):
                 raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
 
+    @cached_property
+    def _start(self) -> tuple[State, Vector]:
+        return self.start()
+
     def start(self) -> tuple[State, Vector]:
         """The instability in the unknowns of the family, and a null vector.
 
@@ -185,12 +194,41 @@ class Varied:
         except NoEigenpair as e:
             raise CaseError(f"the instability has no null vector: {e}") from None
 
-    def null_vector(self, p: float, state: State, m: int) -> Vector:
-        """That of m waves at a state where these are neutral, nearly."""
+    @property
+    def excludes(self) -> bool:
+        """Whether there are waves around a meridian, which its model excludes."""
+        return self._base.scene.model.axisymmetric
+
+    def kind_of(self, m: int, at: Locus | None = None) -> Kind:
+        """What a boundary of m waves is, or of the model's own mode (m = 0) near a point."""
+        if m or (at is None or not self.m):
+            return "bifurcation" if m else self.kind
+        system, phi = self.at(at.p).system, self.mode_at(at, 0, self.m)
+        load = system.load(at.state.u, at.state.mu, self.name)
+        return "fold" if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi) else "bifurcation"
+
+    def mode_at(self, crossing: Locus, m: int, before: int) -> Vector:
+        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary `before`.
+
+        Raises
+        ------
+        BoundaryLost
+            If there is no eigenvector.
+        """
+        if not m:
+            try:
+                return critical_mode(self.at(crossing.p), crossing.state).vector
+            except NoEigenpair as e:
+                raise BoundaryLost(f"the mode that becomes critical has no null vector: {e}") from None
+        return self.null_vector(crossing.p, crossing.state, m, crossing.phi if m == before else None)
+
+    def null_vector(self, p: float, state: State, m: int, beside: Vector | None = None) -> Vector:
+        """That of m waves at a state where these are neutral, nearly; across another one."""
         factors = self.factored(p, state, m)
         v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
         for _ in range(SOLVES):
             v = factors.solve(v)
+            v = v if beside is None else v - (beside @ v) / (beside @ beside) * beside
             v /= np.linalg.norm(v)
         return v
 
@@ -290,10 +328,12 @@ class Varied:
         if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
             raise NoSystem("the symmetry of the model changes on the way: give the case symmetry: none")
         try:
-            made = Scene(moved(self._origin, new), self._origin.comm)
+            on_mesh = moved(self._origin, new)
+            if self._shared and (scene := self._shared.at(p, on_mesh)):
+                return scene
+            return Scene(on_mesh, self._origin.comm)
         except MeshError as e:
             raise NoSystem(f"there is no mesh: {e}") from None
-        return made
 
     def _state_in(self, base: Scene, p: float) -> State:
         """The record's state in the unknowns of the family, which may be in another order."""
@@ -325,21 +365,42 @@ class Varied:
         NoInfluence
             If they are the same.
         """
-        other, (state, phi), comm = self._aside, self.start(), self._origin.model.system.comm
-        own = {self.name: state.mu[self.name]}
-
-        def forces(stage: Stage, p: float) -> Vector:
-            system, mu = stage.newton.system, {**self._fixed(stage, p), **own}
-            here = State(state.u, mu)
-            along = self._times(stage, here, self.m, phi) if self.m else times_tangent(system, here, phi)
-            return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
-
-        self._stages[other] = stage = self._stage(other)
-        before, after, moved_only = forces(self._base, value), forces(stage, other), forces(self._base, other)
+        other, comm = self._aside, self._origin.model.system.comm
+        staged = (self._base, value), (self._stage(other), other), (self._base, other)
+        before, after, moved_only = (self._forces(stage, p) for stage, p in staged)
         size = max_abs(comm, before) or 1.0
         if max_abs(comm, after - before) <= SAME * size:
             raise NoInfluence("it has no influence on this instability")
         return max_abs(comm, after - moved_only) <= SAME * size
+
+    def _share(self, value: float) -> None:
+        """Take the forms of one scene for all values, if the forces of those that have a scene are then the same."""
+        shared = Renumbered.of(self._base.scene)
+        if shared is None:
+            return
+        stages, comm = self._stages, self._origin.model.system.comm
+        own = {p: self._forces(stage, p) for p, stage in stages.items()}
+        change = max(max_abs(comm, forces - own[value]) for forces in own.values())
+        self._shared, self._stages = shared, {}
+        off = [max_abs(comm, self._forces(self._stage(p), p) - forces) for p, forces in own.items()]
+        if max(off) <= SHARED * change:
+            self._base = self._stage(value)
+            return
+        shared.leave()
+        self._shared, self._stages = None, stages
+
+    def _forces(self, stage: Stage, p: float) -> Vector:
+        """At the instability, with other numbers: residual, load, and the tangent along the null vector."""
+        system, (state, phi) = stage.newton.system, self._start
+        mu = {**self._fixed(stage, p), self.name: state.mu[self.name]}
+        here = State(state.u, mu)
+        if self.m:
+            along = self._times(stage, here, self.m, phi)
+        elif stage.scene.model.axisymmetric:  # its matrices cost little, and differences are less exact
+            along = stage.newton.factor_at(here).times(phi)
+        else:
+            along = times_tangent(system, here, phi)
+        return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
 
     def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
         mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
@@ -366,26 +427,12 @@ def moved(scene: Scene, new: Problem) -> Problem:
         if knots.shape != places.shape:
             raise NoSystem("a rim of a dimple appears or vanishes on the way")
         return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))
-    if scene.model.midsurface and not _alike(old.shape, new.shape):
+    if scene.model.midsurface and not alike(old.shape, new.shape):
         patch = scene.model.midsurface.reshaped(new.embedding)
-        one, two = _box(old.shape), _box(new.shape)
+        one, two = box_of(old.shape), box_of(new.shape)
         if one is None or two is None or patch.nodes.shape[1] != 2:
             raise NoSystem("the mesh of this shape cannot move with the number")
         low, size = one[0], one[1] - one[0]
         stretched = two[0] + (patch.nodes - low) / size * (two[1] - two[0])
         return replace(made, shape=replace(patch, nodes=stretched), points=new.points)
     return made
-
-
-def _alike(one: object, two: object) -> bool:
-    a, b = _box(one), _box(two)
-    return a is None or b is None or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
-
-
-def _box(shape: object) -> tuple[Array, Array] | None:
-    """Bounds of the chart."""
-    if isinstance(shape, Grid):
-        return np.array(shape.low), np.array(shape.high)
-    box: tuple[Array, Array] | None = getattr(shape, "box", None)
-    radius = getattr(shape, "radius", None)
-    return (np.zeros(2), np.full(2, radius)) if radius is not None else box

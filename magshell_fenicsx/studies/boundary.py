@@ -6,7 +6,7 @@ import json
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.continuation.augmented import Locus, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
+from magshell_fenicsx.continuation.critical import critical
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -54,6 +55,7 @@ SAID = {
     "meeting": "a second mode is neutral",
     "crossing": "two bifurcations cross",
 }
+CHANGED = "a fold and a bifurcation change their order"
 
 
 @dataclass(frozen=True)
@@ -311,8 +313,8 @@ def _followed(
     rows: list[dict[str, Any]] = []
     begun, end = time.perf_counter(), span.ends[sense > 0]
 
-    def take(label: Label, locus: Locus, m: int) -> None:
-        row = _row(varied, label, locus, m)
+    def take(label: Label, locus: Locus, mode: Boundary) -> None:
+        row = _row(varied, label, locus, mode)
         rows.append(row)
         part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
@@ -320,33 +322,16 @@ def _followed(
         at = f"{row['key']:.9g} {span.unit}".rstrip()
         say(f"{span.key} = {at}: {row['kind']} at {load_said(row, varied.name)}{beside}{left}")
 
-    def curve(m: int) -> Boundary:
-        return Boundary(varied, varied.name, varied.kind, scales, own.recorded, m)
-
-    def take_all(mode: Boundary, start: Locus, sense: float) -> tuple[Locus, float] | None:
-        """Follow one mode, up to where another becomes critical first; that crossing, and its sense."""
-        last = start
-        for label, locus in mode.followed(start, sense, span.ends, span.steps):
-            if last is start and label == "crossing" and locus.met == start.met:  # where it has begun
-                continue
-            take(label, locus, mode.m)
-            if label == "crossing" and not last.unstable:
-                return locus, locus.p - last.p
-            last = locus
-        return None
+    def curve(m: int, at: Locus | None = None) -> Boundary:
+        kind = varied.kind_of(m, at)
+        return Boundary(varied, varied.name, kind, scales, own.recorded, m, varied.excludes)
 
     try:
         mode = curve(varied.m)
         start = mode.start(value, *varied.start())
-        rows.append(_row(varied, "start", start, mode.m))
-        crossed = take_all(mode, start, sense)
-        while crossed:
-            crossing, onward = crossed
-            before, mode = mode.m, curve(crossing.met)
-            critical = varied.null_vector(crossing.p, crossing.state, mode.m)
-            there = mode.start(crossing.p, crossing.state, critical)
-            there = replace(there, met=before, unstable=there.unstable - there.unstable_of(before))
-            crossed = take_all(mode, there, onward)
+        rows.append(_row(varied, "start", start, mode))
+        for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
+            take(label, locus, on)
     except BoundaryLost as e:
         if not rows:
             raise Stopped(str(e)) from None
@@ -354,13 +339,14 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": varied.alone}
 
 
-def _row(varied: Varied, label: Label, locus: Locus, m: int) -> dict[str, Any]:
-    waves = sorted({m, locus.met}) if label == "crossing" else [m]
+def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary) -> dict[str, Any]:
+    families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
+    own = varied.kind_of(0, locus) if len(families) > 1 else "" if varied.m else varied.mode
     return {
         "key": float(locus.p),
         **_load(varied.name, locus.state.mu[varied.name], varied.problem(locus.p)),
-        "kind": label if label in SPECIAL else varied.kind,
-        "mode": ", ".join(f"{WAVES}{each}" for each in waves) if m else varied.mode,
+        "kind": label if label in SPECIAL else mode.kind,
+        "mode": ", ".join(f"{WAVES}{m}" if m else own for m in families),
         "error": float(locus.load_error),
         "unstable": int(locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)),
         "factorisations": int(locus.factorisations),
@@ -382,7 +368,7 @@ def _put_together(
     special = [row for row in rows if row["kind"] in SPECIAL]
     said = [
         f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
-        + f", {load_said(row, begin['amplitude'])}: {SAID[row['kind']]}"
+        + f", {load_said(row, begin['amplitude'])}: {CHANGED if 'fold' in row['mode'] else SAID[row['kind']]}"
         + (f", {row['mode']}" if row["kind"] == "crossing" else "")
         for row in special
     ]

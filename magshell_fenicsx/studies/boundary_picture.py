@@ -16,10 +16,10 @@ WORDS = {
     "cusp": "cusp",
     "turn": "turning point",
     "meeting": "second mode neutral",
-    "crossing": "two bifurcations cross",
+    "crossing": "another mode comes first",
 }
 LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-NARROW = 0.25  # of the width of the picture: a region that has no place for more than its mode
+NARROW, LOW = 0.25, 0.08  # of the width of the picture: a region that has no place for more than its mode, or for that
 Row = Mapping[str, Any]
 
 
@@ -163,16 +163,18 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
 
     Where a bifurcation comes after other instabilities it divides nothing that is stable.
     """
-    if content["kind"] != "fold":
-        rows = [row for row in rows if not row["unstable"]] or rows
+    rows = [row for row in rows if not row["unstable"]] or rows
     parts, whole = _by_mode(rows), _beside(rows, content, limits)
     if len(parts) < 2:
         return whole
     extent, named = np.ptp([row["key"] for row in rows]), [each for each in whole if each[2] == "stable"]
     for mode, part in parts:
-        for x, y, words in _beside(part, {**content, "mode": mode}, limits)[:1]:
-            narrow = np.ptp([row["key"] for row in part]) < NARROW * extent
-            named.append((x, y, mode if narrow else words))
+        kind = next(row["kind"] for row in part if row["kind"] in ("fold", "bifurcation"))
+        for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
+            width = np.ptp([row["key"] for row in part]) / extent
+            outer = limits[1] if y > 0 else limits[0]
+            y = (y + outer) / 2 if width < LOW else y  # beside the names of its neighbours
+            named.append((x, y, mode if width < NARROW and mode else words))
     return named
 
 

@@ -11,6 +11,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.augmented import Kind, Locus
 from magshell_fenicsx.continuation.boundary import Boundary, Label
+from magshell_fenicsx.continuation.critical import critical
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
@@ -152,4 +153,45 @@ def test_two_families_of_excluded_modes_cross(costly: bool, m: int, rise: float,
         assert label == "crossing" or bool(locus.unstable) == (way * (locus.p - 2.8) > 0)
     (crossing,) = (locus for label, locus in found if label == "crossing")
     assert (crossing.met, crossing.p) == (3 - m, pytest.approx(2.8, abs=1e-8))
+    assert found[-1][0] == "end"
+
+
+class WithoutPairs(WithoutModes):
+    """The same where both modes are of one family, to which they are unlike."""
+
+    def factored(self, p: float, state: State, m: int) -> Factorisation:
+        matrix = PETSc.Mat().createAIJ([2, 2], nnz=1, comm=MPI.COMM_SELF)
+        for i, v in enumerate(np.eye(2)):
+            matrix.setValue(i, i, self.along(p, state, m, v))
+        matrix.assemble()
+        factors = Factorisation(MPI.COMM_SELF)
+        factors.factor(matrix)
+        return factors
+
+    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+        return float(sum(super(WithoutPairs, self).along(p, state, i, v[i - 1 : i]) for i in (1, 2)))
+
+    def counts(self, p: float, state: State) -> list[int]:
+        return [sum(self.along(p, state, 1, v) < 0 for v in np.eye(2))]
+
+
+@pytest.mark.parametrize(("rise", "way", "first"), [(3.2, -1.0, 1), (2.45, 1.0, 2)])
+def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> None:
+    """At a rise of 2.8 again; the boundary goes on with the other mode, which is then the first one."""
+
+    def alone(rise: float) -> Toy:
+        gradient, hessian = arch(rise).gradient, arch(rise).hessian
+        return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+
+    a = np.sqrt(rise**2 - neutral(first, rise))
+    mode = Boundary(WithoutPairs(alone), "load", "bifurcation", (10.0, 1.0), m=1)
+    start = mode.start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.eye(2)[first - 1])
+    found = [*critical(lambda *_: mode, lambda at, *_: at.phi[::-1], mode, start, way, (2.42, 3.3), 20)]
+    (crossing,) = (locus for label, locus, _ in found if label == "crossing")
+    assert (crossing.met, crossing.p) == (1, pytest.approx(2.8, abs=1e-7))
+    for label, locus, _ in found:
+        own = first if way * (locus.p - 2.8) < 0 else 3 - first
+        a = np.sqrt(locus.p**2 - neutral(own, locus.p))
+        assert locus.state.mu["load"] == pytest.approx(load_of(a, locus.p), rel=1e-6)
+        assert label == "crossing" or not locus.unstable
     assert found[-1][0] == "end"
