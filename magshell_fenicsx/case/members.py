@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member
-from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
+from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, SECOND_CUT, Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shape.ground import Ground
 from magshell_fenicsx.shape.outline import ground_of
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Vectors
 
 if TYPE_CHECKING:
@@ -33,13 +34,16 @@ class Members:
         return [self._member(part, None) for part in self._several.parts]
 
     def half(self, plane: Mirror) -> Assembly:
-        """The halves of all shells on the one side of a plane, which is one of `mirrors`."""
+        """The halves of all shells on the one side of a plane, which is one of `mirrors`, or their sectors."""
         whole, parts = self._several.assembly, self._several.parts
 
         def halves() -> list[Member]:
+            if isinstance(plane, Sector):
+                return [self._sector(part, plane) for part in parts]
             return [self._member(part, self._own(part, plane)) for part in parts]
 
-        return replace(whole, digest=f"{whole.digest} {plane.plane.tolist()}", members=halves, halved=True)
+        waves = f" {plane.waves}" if isinstance(plane, Sector) else ""
+        return replace(whole, digest=f"{whole.digest} {plane.plane.tolist()}{waves}", members=halves, halved=True)
 
     def mirrors(self, vectors: Vectors, loosely: bool) -> list[Mirror]:
         """The planes in which each shell is its own image, as those of the halves on both of their sides.
@@ -75,6 +79,23 @@ class Members:
         place = self._several.place(part)
         turned = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
         return Member(part.name, patch, turned, tuple(part.section.points))
+
+    def _sector(self, part: "Part", sector: Sector) -> Member:
+        """The sector of a shell; one that is upside down has the two planes the other way round."""
+        first, second = (self._own(part, side) for side in sector.sides.values())
+        closed = ground_of(part.case.shell).perfect.round or isinstance(part.case.shell, MeshSurface)
+        for begin, end in ((first, second), (second, first)):
+            own = Sector.at(begin.azimuth, sector.waves)
+            if closed and begin.through_e3 and own.is_plane_of(begin) and own.second.is_plane_of(end):
+                break
+        else:
+            raise CaseError(part.refused(f"place: symmetry: {sector.waves} needs shells that are closed around e3"))
+        member = self._member(part, own)
+        if begin is first:
+            return member
+        other = {CUT: SECOND_CUT, SECOND_CUT: CUT}
+        edges = {other.get(name, name): pairs for name, pairs in member.patch.edges.items()}
+        return replace(member, patch=replace(member.patch, edges=edges))
 
     def _own(self, part: "Part", plane: Mirror) -> Mirror:
         """A plane in the frame of a shell and over its own length, with its edges that are lost."""

@@ -137,6 +137,8 @@ def make_problem(
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     rims = different(local)
+    if case.joints and isinstance(beyond, Sector):
+        raise CaseError(f"symmetry: {case.symmetry}: not with joints: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
@@ -182,7 +184,7 @@ def make_problem(
         warning=next((said for part in context.abilities if (said := part.warning(context, sample))), None)
         or _wrong_unit(case, sample),
         lambda_m=case.lambda_m,
-        unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, half=half)),
+        unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, plane)),
         patched=bool(case.patches),
         stability=case.stability,
         frequencies=case.frequencies,
@@ -345,9 +347,12 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         places = [np.array(x) for x in case.points.values()]
         if sector_of_waves := sector(parts, drawn, case.symmetry, places):
             return False, sector_of_waves
+        hint = "; the mesh file must be its own image in both, with each of its edges and patches"
+        hint = hint if isinstance(case.shell, MeshSurface) else ""
+        hint = "; each shell is held, and its own image in both" if case.several else hint
         raise CaseError(
             f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
-            f"angle of {180 / case.symmetry:g} degrees with all named points between them"
+            f"angle of {180 / case.symmetry:g} degrees with all named points between them{hint}"
         )
     if case.symmetry not in ("auto", "half"):
         return False, None
@@ -379,12 +384,12 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     return points
 
 
-def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:
+def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:
     """About how many triangles there will be."""
     if isinstance(shape, MeshFile):
         halved = isinstance(shape.given, Assembly)  # it has the cells of its half
-        return cell_count(shape) * (0.5 if half and not halved else 1.0)
-    return shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
+        return cell_count(shape) / (plane.copies if plane and not halved else 1)
+    return shape.cells * (0.5 if plane else 1.0) if isinstance(shape, Grid) else size.cells(shape)
 
 
 def _turned(components: tuple[int, ...], turn: float) -> list[int]:

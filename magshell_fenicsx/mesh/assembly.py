@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.mirror import CUT, Mirror
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Mirror
 from magshell_fenicsx.mesh.patch import (
     Embedding,
     MeshError,
@@ -111,9 +111,9 @@ class Assembly:
     mirrors
         Planes in which each shell is its own image, see `Outline.mirrors`.
     half
-        Its half at such a plane, on whose positive side it is.
+        Its half at such a plane, on whose positive side it is, or its sector.
     halved
-        Whether it is a half itself: edges on its plane are one, `CUT`.
+        Whether it is a half or a sector itself: edges on a plane are one, `CUT` or `SECOND_CUT`.
     home
         None: no program gave a mesh.
     """
@@ -169,8 +169,8 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
         cells.append(patch.cells + first)
         one.append((np.arange(count) if patch.one is None else patch.one) + first)
         for name, pairs in patch.edges.items():
-            on_plane = halved and name == CUT
-            before = [edges[CUT]] if on_plane and CUT in edges else []
+            on_plane = halved and name in (CUT, SECOND_CUT)
+            before = [edges[name]] if on_plane and name in edges else []
             edges[name if on_plane else f"{member.name}_{name}"] = np.concatenate([*before, pairs + first])
         points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in member.points}
         every = np.ones(len(patch.cells), dtype=bool)

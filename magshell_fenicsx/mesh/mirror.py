@@ -219,13 +219,19 @@ Y0 = Mirror(
 
 
 def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
-    """The half of a triangulation; its edge on the plane is `CUT`.
+    """The half of a triangulation, or its sector; its edges on the planes have the names of these.
 
     Raises
     ------
     MeshError
-        If triangles lie across the plane.
+        If triangles lie across a plane.
     """
+    for name, plane in mirror.sides.items():
+        patch = _halved(patch, plane, name)
+    return patch
+
+
+def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     places = patch.embedding(patch.nodes)
     beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
     kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
@@ -240,21 +246,21 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
     one = np.arange(len(patch.nodes)) if patch.one is None else patch.one
     first = np.full(len(patch.nodes), -1, dtype=np.int64)  # for each vertex, its first node that is kept
     first[one[used][::-1]] = np.arange(len(used))[::-1]
-    edges = {name: first[one[pairs]] for name, pairs in patch.edges.items()}
+    edges = {edge: first[one[pairs]] for edge, pairs in patch.edges.items()}
     border = border_pairs(first[one[used[directed_sides(cells)]]])
     edges = on_border(edges, border)
-    named = {pair for lines in edges.values() for pair in as_set(lines)}
-    if on_plane := sorted(as_set(border) - named):
-        edges[CUT] = np.array(on_plane, dtype=np.int64)
+    in_edges = {pair for lines in edges.values() for pair in as_set(lines)}
+    if on_plane := sorted(as_set(border) - in_edges):
+        edges[name] = np.array(on_plane, dtype=np.int64)
     return replace(
         patch,
         nodes=patch.nodes[used],
         cells=cells,
         edges=edges,
         one=None if patch.one is None else first[one[used]],
-        patches={name: inside[kept] for name, inside in patch.patches.items()},
+        patches={each: inside[kept] for each, inside in patch.patches.items()},
         given=None if patch.given is None else patch.given[kept],
-        feet={name: on[kept] for name, on in patch.feet.items()},
+        feet={edge: on[kept] for edge, on in patch.feet.items()},
     )
 
 

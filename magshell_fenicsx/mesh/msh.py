@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.branches import renamed, separated
 from magshell_fenicsx.mesh.midsurface import nodal_normals
-from magshell_fenicsx.mesh.mirror import Mirror, cut
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
 from magshell_fenicsx.mesh.patch import (
     MeshError,
@@ -226,6 +226,8 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
         patch = _whole(file)
     except MeshError as e:
         raise MeshError(f"shell: {e}" if file.given else f"shell.file: {e}") from None
+    if isinstance(mirror, Sector) and patch.feet:
+        raise MeshError(f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half")
     patch = cut(patch, mirror) if mirror else patch
     return replace(patch, points=_vertices(patch.nodes, patch.cells, points, file.scale))
 

@@ -1,14 +1,14 @@
 """The mesh of a sector around e3 and its mirror images, side by side."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Sector, rotation
+from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 
 Array = NDArray[np.float64]
 CLOSE = 1e-7  # over the chart's extent: nodes that are one
@@ -57,6 +57,14 @@ class Folding:
         along = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]  # at pi rounding has a sign
         return np.asarray(np.clip(np.floor(along / self.end), 0, self.count - 1), dtype=np.int64)
 
+    def embedding(self, of: Embedding) -> Embedding:
+        """That of all copies, which have the chart in common."""
+        return of
+
+    def key(self, nodes: Array) -> Array:
+        """What nodes have in common that are one: their places."""
+        return nodes
+
     def back(self, chart: Array) -> Array:
         """The places of the sector whose copies these are."""
         places, copies = np.empty_like(chart), self.copies(chart)
@@ -71,18 +79,84 @@ class Folding:
         return places
 
 
-def unfolded(patch: PatchMesh, folding: Folding, ends: tuple[str, str]) -> PatchMesh:
+class FoldingInSpace:
+    """The same for a triangulation in space: that of a mesh file, or of several shells, whose nodes are not shared."""
+
+    def __init__(self, sector: Sector, patch: PatchMesh) -> None:
+        self.count, self._sector = sector.waves, sector
+        self._several = hasattr(patch.embedding, "charts")
+
+    def image(self, nodes: Array, k: int) -> Array:
+        """Copy k of nodes; those of several shells get k as their last number but one."""
+        images, vectors = nodes.copy(), 1 if self._several else nodes.shape[1] // 3  # places, and normals if any
+        for i in range(vectors):
+            images[:, 3 * i : 3 * i + 3] = nodes[:, 3 * i : 3 * i + 3] @ self.turn(k).T
+        return np.insert(images, -1, k, axis=1) if self._several else images
+
+    def turn(self, k: int) -> Array:
+        """See `Folding`."""
+        begin = rotation(self._sector.azimuth)
+        angle = self._sector.angle
+        Q = rotation(-(k + 1) * angle) @ np.diag([1.0, -1.0, 1.0]) if k % 2 else rotation(-k * angle)
+        return np.asarray(begin.T @ Q @ begin)
+
+    def copies(self, x: Array) -> NDArray[np.int64]:
+        """In which copy each place (n, 3) of the half lies."""
+        at = x @ rotation(self._sector.azimuth).T
+        along = np.abs(np.arctan2(at[:, 1], at[:, 0]))
+        return np.asarray(np.clip(np.floor(along / self._sector.angle), 0, self.count - 1), dtype=np.int64)
+
+    def back(self, x: Array) -> Array:
+        """The places of the sector whose copies these are."""
+        turns = np.array([self.turn(k) for k in range(self.count)])[self.copies(x)]
+        return np.asarray(np.einsum("ni,nij->nj", x, turns))
+
+    def embedding(self, of: Embedding) -> Embedding:
+        """That of all copies."""
+        return CopiesEmbedded(of, tuple(self.turn(k) for k in range(self.count))) if self._several else of
+
+    def key(self, nodes: Array) -> Array:
+        """What nodes of copies have in common that are one: the place, and the shell."""
+        return nodes[:, [0, 1, 2, -1]] if self._several else nodes
+
+
+@dataclass(frozen=True)
+class CopiesEmbedded:
+    """Nodes of copies of several shells -> places (n, 3), each by the nodes of the sector and its matrix (3, 3)."""
+
+    of: Embedding
+    turns: tuple[Array, ...]
+
+    @property
+    def charts(self) -> bool:
+        """See `assembly.Embedded`."""
+        return bool(getattr(self.of, "charts", False))
+
+    def __call__(self, nodes: Array) -> Array:
+        turns = np.array(self.turns)[np.rint(nodes[:, -2]).astype(int)]
+        return np.asarray(np.einsum("nij,nj->ni", turns, self.of(np.delete(nodes, -2, axis=1))))
+
+
+def folding_of(sector: Sector, patch: PatchMesh) -> "Folding | FoldingInSpace":
+    """The copies of a sector that make a half."""
+    if patch.nodes.shape[1] > 2:
+        return FoldingInSpace(sector, patch)
+    return Folding(sector.angle, sector.waves, patch)
+
+
+def unfolded(patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[str, str]) -> PatchMesh:
     """The triangulation of all copies, from that of the sector; the edges where it begins and ends have these names."""
     n, count = len(patch.nodes), folding.count
     nodes = np.concatenate([folding.image(patch.nodes, k) for k in range(count)])
     over = TURNED_OVER[patch.cells.shape[1]]
     cells = np.concatenate([k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(count)])
-    tree = scipy.spatial.cKDTree(nodes)
-    near = tree.query_ball_point(nodes, CLOSE * np.ptp(nodes, axis=0).max())
+    keys = folding.key(nodes)
+    near = scipy.spatial.cKDTree(keys).query_ball_point(keys, CLOSE * np.ptp(keys, axis=0).max())
     same = np.array([min(each) for each in near])
     one = np.arange(n) if patch.one is None else patch.one
     glued = same[np.concatenate([k * n + one for k in range(count)])]
-    used, numbers = np.unique(same, return_inverse=True)
+    apart = keys is not nodes  # then each copy keeps its nodes, and vertices are glued
+    used, numbers = np.unique(np.arange(len(nodes)) if apart else same, return_inverse=True)
     new = np.full(len(nodes), -1, dtype=np.int64)
     new[used] = np.arange(len(used))
 
@@ -99,9 +173,12 @@ def unfolded(patch: PatchMesh, folding: Folding, ends: tuple[str, str]) -> Patch
         patch,
         nodes=nodes[used],
         cells=numbers[cells],
+        embedding=folding.embedding(patch.embedding),
         edges=edges,
-        one=None if patch.one is None else new[glued[used]],
+        points={name: folding.image(x[None], 0)[0] for name, x in patch.points.items()},
+        one=new[glued[used]] if apart or patch.one is not None else None,
         patches={name: np.tile(inside, count) for name, inside in patch.patches.items()},
+        given=None if patch.given is None else np.tile(patch.given, (count, 1)),
     )
 
 

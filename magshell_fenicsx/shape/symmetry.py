@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from math import atan2, hypot, pi
+from math import atan2, cos, hypot, pi, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,13 +107,30 @@ def sector(parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vect
     places
         Named places (3,), which may choose where it begins.
     """
-    azimuth = common_azimuth([v for part in parts for v in part.vectors])
-    if not outline.round or azimuth is None:
+    vectors = [v for part in parts for v in part.vectors]
+    azimuth = common_azimuth(vectors)
+    if azimuth is None:
         return None
-    beside = [a for part in parts for a in part.azimuths] + [atan2(x[1], x[0]) for x in places if tilted(x)]
-    begins = [a + turn for a in (azimuth, *beside) for turn in (0.0, -pi / waves, pi)]
+    if outline.round:
+        beside = [a for part in parts for a in part.azimuths] + [atan2(x[1], x[0]) for x in places if tilted(x)]
+        begins = [a + turn for a in (azimuth, *beside) for turn in (0.0, -pi / waves, pi)]
+    else:
+        begins = [plane.azimuth for plane in _upright(outline, [unit(v) for v in (*vectors, *places)])]
     sectors = (Sector.at(begin, waves) for begin in begins)
-    return next((s for s in sectors if all(part.mirrors(side) for part in parts for side in s.sides.values())), None)
+    fitting = (s for s in sectors if all(part.mirrors(side) for part in parts for side in s.sides.values()))
+    return next((s for s in fitting if outline.round or _ends(outline, s)), None)
+
+
+def _upright(outline: "Outline", vectors: Vectors) -> list[Mirror]:
+    """The planes through e3 of an outline that is not round, which map each edge onto itself."""
+    return [plane for plane in outline.mirrors(vectors, False) if plane.through_e3 and not plane.lost]
+
+
+def _ends(outline: "Outline", sector: Sector) -> bool:
+    """Whether the second plane of a sector is one of an outline too."""
+    end = sector.azimuth + sector.angle
+    planes = _upright(outline, [np.array([cos(end), sin(end), 0.0])])
+    return any(sector.second.is_plane_of(plane) for plane in planes)
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:

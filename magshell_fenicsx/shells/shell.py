@@ -336,7 +336,8 @@ class ShellModel(Thin):
         """The same shell on the mid-surface of a half."""
         material, degree, conditions, loads, sigma, thickness = self._given
         conditions = {name: c for name, c in conditions.items() if name != SECOND_CUT}
-        return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness)
+        plane = Mirror.upright(self.mirror.azimuth)
+        return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness, plane)
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:

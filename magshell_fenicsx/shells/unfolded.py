@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import CUT, Sector
-from magshell_fenicsx.mesh.unfolding import Folding, unfolded
+from magshell_fenicsx.mesh.unfolding import folding_of, unfolded
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class UnfoldedModes:
         """The model whose tangents are counted."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
-        self._folding = Folding(sector.angle, sector.waves, patch)
+        self._folding = folding_of(sector, patch)
         half = self._as_half(distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm))
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))

@@ -1,0 +1,93 @@
+"""Sectors of several shells and of a mesh file, against the halves that their copies make."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import CASES
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.unfolded import UnfoldedModes
+
+h = 0.02
+MATERIAL = {"thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+RING = {
+    "shell": {"geometry": "annulus", "radius": 1, "inner_radius": 0.6, **MATERIAL},
+    "boundary": {"outer": "clamped"},
+}
+TURNED = {**RING, "place": {"position": [0, 0, 1.2 * h], "axis": {"polar": 180, "azimuth": 20}}}
+RINGS: dict[str, Any] = {
+    "shells": {"lower": RING, "upper": TURNED},
+    "contact": [["upper", "lower"]],
+    "loading": {"kind": "pressure", "on": {"upper": "outside"}},
+    "mesh": {"degree": 3, "size": 0.4},
+}
+GRIPPER = read_source(CASES / "gripper_closed.yaml")
+
+
+def sector(name: str) -> Case:
+    """A case in the sector of 30 or of 45 degrees."""
+    return Case.from_source(RINGS | {"symmetry": 6}) if name == "rings" else Case.from_source(GRIPPER)
+
+
+NOT_THERE: dict[str, tuple[dict[str, Any], str]] = {
+    "another axis": (
+        {"shells": {"lower": RING, "upper": {**RING, "place": {"position": [3, 0, 0]}}}},
+        "no two mirror planes .* each shell is held, and its own image in both",
+    ),
+    "joints": (
+        {
+            "shells": {"lower": RING, "upper": {**TURNED, "place": {"position": [0, 0, 0], "axis": {"polar": 180}}}},
+            "joints": [{"edges": ["lower.outer", "upper.outer"]}],
+            "contact": [],
+        },
+        "symmetry: 6: not with joints: take symmetry: half",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NOT_THERE)
+def test_no_sector(name: str) -> None:
+    keys, message = NOT_THERE[name]
+    with pytest.raises((CaseError, MeshError), match=message):
+        make_problem(Case.from_source({**RINGS, "contact": [], "symmetry": 6, **keys})).triangulated()
+
+
+def symmetric(scene: Scene, size: float) -> np.ndarray:
+    """A displacement of the sector with waves around e3, that closes the gap of the rings."""
+    model, m = scene.model, scene.problem.mirror.waves  # type: ignore[union-attr]
+    x = model.r0.x.array[: model.system.size].reshape(-1, 3)
+    angle, rho = np.arctan2(x[:, 1], x[:, 0]), np.hypot(x[:, 0], x[:, 1])
+    begin = scene.problem.mirror.azimuth  # type: ignore[union-attr]
+    wave, out = np.cos(m * (angle - begin)), np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    u = size * h * ((1 + 0.1 * wave) * rho)[:, None] * (0.2 * out + [0, 0, 1])
+    upper = x[:, 2] > 0.5 * h
+    u[upper] = -u[upper]
+    return np.asarray(model.system.held(u.ravel()))
+
+
+@pytest.mark.parametrize("name", ["rings", "gripper"])
+def test_copies_make_the_half(name: str) -> None:
+    """Energy, contact force and residual of the half at the copies of a displacement: those of the sector, 1e-9."""
+    scene = Scene(sector(name))
+    model, waves = scene.model, scene.problem.mirror.waves  # type: ignore[union-attr]
+    assert isinstance(model, ShellModel)
+    assert isinstance(model.excluded_modes, UnfoldedModes)
+    half = model.excluded_modes.half
+    assert (model.multiplicity, half.multiplicity) == (2 * waves, 2)
+    u, mu = symmetric(scene, 0.4 if name == "rings" else 2.0), {**scene.unloaded().mu}
+    mu |= {key: 1e-3 for key in ("lambda_m", "pressure") if key in mu}
+    copies = model.excluded_modes.unfolded(u)
+    way = symmetric(scene, 1.0) * (1 + np.arange(model.system.size) % 2)  # of no meaning, and not along u
+    way = model.system.held(way) if name == "rings" else u
+    works = [model.system.residual(u, mu) @ way, half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way)]
+    assert works[1] == pytest.approx(waves * works[0], rel=1e-9)
+    ours, theirs = (system.at(State(v, mu)) for system, v in ((model.system, u), (half.system, copies)))
+    forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
+    assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)
+    assert (forces[0] > 0) == (name == "rings")
