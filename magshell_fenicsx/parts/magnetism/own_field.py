@@ -13,7 +13,7 @@ from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, place
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
-from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
+from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.seen import Sight
@@ -73,18 +73,15 @@ class OwnField:
         faces = Faces(shape, np.arange(self._owned), may=may)
         return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
 
-    def B(self, families: Sequence[Family], mu: Mapping[str, float], x: Array) -> Array:
-        """The field (3,) at a place, of a remanence of length one; nan in the shell; collective."""
-        try:
-            images = [image.back(x) for image in self._images]
-            if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
-                raise TooNear
-            total = np.zeros(3)
-            for image in self._images:
-                sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
-                total = total + sign * image.Q @ field(families, image.back(x)[None])[0]
-        except TooNear:
-            total = np.full(3, np.nan)
+    def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
+        """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell; collective."""
+        total, faces = np.zeros_like(places), [family for family in families if isinstance(family, Faces)]
+        for image in self._images:
+            seen_from, sign = image.back(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
+            held = np.logical_or.reduce([family.holds(seen_from) for family in faces])
+            total[held] = np.nan
+            out = ~np.isnan(total[:, 0])
+            total[out] += sign * field(families, seen_from[out]) @ image.Q.T
         return np.asarray(self._model.system.comm.allreduce(total))
 
     def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
