@@ -1,6 +1,7 @@
 """The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -69,9 +70,14 @@ class OwnField:
     def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
         """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
         shape = self.shape(mu)
-        cells, edges = self._sides(every=True) if may else self.edges
+        cells, edges = self.chargeable if may else self.edges
         faces = Faces(shape, np.arange(self._owned), may=may)
         return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
+
+    @cached_property
+    def chargeable(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """As `edges`, all that any remanence may charge."""
+        return self._sides(every=True)
 
     def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
         """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell; collective."""
