@@ -76,7 +76,10 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if slope and name in ("thickness", "deviation"):
         raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
     if scene.problem.loads.interaction and name in OF_CHARGES:
-        raise CaseError(f"{name}: beside magnetic.interaction no result has a gradient by this field; allowed are remanence, magnitude")
+        raise CaseError(
+            f"{name}: beside magnetic.interaction no result has a gradient by this field; allowed are remanence, "
+            "magnitude"
+        )
     knowing = [term for term in model.system.terms if isinstance(term, KnowsFields)]
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
