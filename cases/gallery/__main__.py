@@ -81,16 +81,17 @@ def thumbnails(names: Sequence[str]) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of sensors their readings, of motions and snaps the curve, of a
-    bifurcation its mode.
+    """The pictures that show the result best: of field maps these, of sensors their readings, of motions and snaps the
+    curve, of a bifurcation its mode.
 
     Where the branch that begins there is followed, that is the shell. Beside bodies and magnets these are shown.
     """
     if not (folder / "path.csv").exists():
         return []
     rows = read_rows(folder / "path.csv")
-    if (folder / "sensors.png").exists():
-        return ["sensors.png"]
+    for name in ("field_maps.png", "sensors.png"):
+        if (folder / name).exists():
+            return [name]
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
     steps = case_in(folder)["loading"]

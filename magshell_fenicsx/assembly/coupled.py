@@ -33,6 +33,17 @@ class Couplings(Protocol):
         """This rank's part of the terms' product with a vector, both with ghosts. Collective."""
 
 
+@runtime_checkable
+class KnowsFields(Protocol):
+    """A term without a form that knows its derivatives by the fields in it."""
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def by_field(self, direction: fem.Function, energy: float, force: float) -> tuple[fem.Function, Array]:
+        """A field, and the derivatives of energy Pi + force v . dPi/du by its values in own cells. Collective."""
+
+
 def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:
     """What the terms among these add that are `Coupled`; `clamped` are homogeneous conditions."""
     coupled = [t for t in terms if isinstance(t, Coupled)]

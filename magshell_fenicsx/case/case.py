@@ -29,6 +29,7 @@ from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.joints import Joints
 from magshell_fenicsx.parts.kinds import Bodies
+from magshell_fenicsx.parts.magnetism.field_maps import FieldMaps
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
 Waves = Annotated[int, Field(ge=1, le=200)]
-LIKE_THE_SHELL = ("mesh", "points", "sensors", "natural", "bodies", "joints", "loading", *PARTS)
+LIKE_THE_SHELL = ("mesh", "points", "sensors", "field_maps", "natural", "bodies", "joints", "loading", *PARTS)
 """Sections whose numbers have units where the shell's lengths have."""
 
 
@@ -76,6 +77,8 @@ class Case(WithParts):
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
     """Name -> point at which the magnetic field is read"""
+    field_maps: FieldMaps = Field(default_factory=dict)
+    """Name -> grid on which the magnetic field is computed, for ParaView and drawn"""
     natural: NaturalSection | None = None
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)

@@ -20,6 +20,7 @@ from magshell_fenicsx.models.shell.parameters import (
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.bodies.contact import Contact
     from magshell_fenicsx.parts.joints import Joint
+    from magshell_fenicsx.parts.magnetism.field_maps import FieldMap
     from magshell_fenicsx.parts.magnetism.interaction import Interaction
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
@@ -43,6 +44,8 @@ class Loads:
         What is magnetised where no field is applied: it loads nothing, and is drawn.
     sensors
         Where its magnetic field is read.
+    field_maps
+        Grids on which it is computed.
     interaction
         How strongly its magnetised parts act on each other; None if they do not.
     pairs
@@ -63,6 +66,7 @@ class Loads:
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: "Magnetisation | None" = None
     sensors: "tuple[Sensor, ...]" = ()
+    field_maps: "tuple[FieldMap, ...]" = ()
     interaction: "Interaction | None" = None
     pairs: "tuple[Pair, ...]" = ()
     joints: "tuple[Joint, ...]" = ()

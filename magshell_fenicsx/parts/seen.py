@@ -1,7 +1,7 @@
 """What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate to amplitudes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -87,6 +87,40 @@ class Slope:
     by_field: "Array | None" = None
 
 
+@dataclass(frozen=True)
+class Grid:
+    """A rectangle or a box in space with vectors at its points, in the frame of the case; lengths are over R.
+
+    Attributes
+    ----------
+    corner, sides
+        (3,) where it begins, and (2, 3) or (3, 3) its sides, perpendicular to each other.
+    points
+        How many along each side.
+    unit
+        Of the values.
+    words
+        What the values are.
+    values
+        (n, 3) at the points, along the first side first; nan where there are none.
+    """
+
+    name: str
+    corner: Array
+    sides: Array
+    points: tuple[int, ...]
+    unit: str
+    words: str
+    values: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def places(self) -> Array:
+        """(n, 3) of its points."""
+        along = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij")
+        shares = np.stack([each.ravel() for each in along[::-1]], axis=-1)
+        return np.asarray(self.corner + shares @ self.sides)
+
+
 class Seen:
     """What a room sees; by default nothing.
 
@@ -143,6 +177,14 @@ class Seen:
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Column -> value."""
         return {}
+
+    def grids(self, loads: "Loads") -> Sequence[str]:
+        """Names of the grids in space on which it sees something."""
+        return ()
+
+    def on_grids(self, sight: Sight, state: "State") -> Sequence[Grid]:
+        """These grids with what it sees there; collective."""
+        return ()
 
     def differentiable(self, loads: "Loads") -> Sequence[str]:
         """Its columns that have a `slope`."""

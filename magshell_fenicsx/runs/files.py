@@ -18,6 +18,7 @@ from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.grids import grid_content
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, solids
 from magshell_fenicsx.output.fields.surface import turned, whole
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
@@ -38,6 +39,7 @@ from magshell_fenicsx.output.store.written import (
     written,
 )
 from magshell_fenicsx.output.store.written import NAME as LIST
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -234,11 +236,13 @@ class RunFiles:
         halved = problem.mirror and not isinstance(problem.mirror, Sector)  # of which ParaView has one half
         mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror and halved else None
         self._of_whole = mirror is None
-        about = About(problem.material.h, problem.material.nu, mirror, given(problem.context.shell).R)
+        self._R = given(problem.context.shell).R
+        about = About(problem.material.h, problem.material.nu, mirror, self._R)
         drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
         moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)
         name = "" if not drawn else DRIVEN if moves else STILL
-        self._fields = FieldSeries(self._folder / "fields", about, name, self._table.kept)
+        grids = [grid for room in SEEN for grid in room.grids(problem.loads)]
+        self._fields = FieldSeries(self._folder / "fields", about, name, self._table.kept, grids)
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept
 
@@ -258,6 +262,7 @@ class RunFiles:
         if scene is not self._scene:
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
+        grids = [grid for room in SEEN for grid in room.on_grids(scene.sight, state)]
 
         def write() -> None:
             assert surface is not None
@@ -266,7 +271,8 @@ class RunFiles:
             every = whole(surface, mirror) if mirror and (isinstance(mirror, Sector) or self._of_whole) else surface
             drawn = replace(every, outlines=outlines(*beside), solids=solids(*beside))
             self._table.write(row)
-            self._fields.write(number, turned(drawn, problem.azimuth), row)
+            beside_it = {grid.name: grid_content(grid, self._R) for grid in grids}
+            self._fields.write(number, turned(drawn, problem.azimuth), row, beside_it)
 
         by_first(self._comm, write)
 

@@ -76,7 +76,8 @@ class Number(Bounded):
 
 def by_components(scene: Scene, by: FieldGradient) -> Array:
     """The derivatives by the components of the remanence at its points; collective."""
-    magnetic = scene.problem.loads.magnetic
+    loads = scene.problem.loads
+    magnetic = loads.magnetic or loads.remanence
     assert magnetic
     assert isinstance(magnetic.remanent, ByControls)
     return np.asarray(by.field.function_space.mesh.comm.allreduce(magnetic.remanent.pulled(by.places, by.forces)))

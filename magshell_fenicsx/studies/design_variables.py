@@ -244,8 +244,12 @@ def controls_of(case: Case, count: int | None, width: float | None, where: str) 
         If there is no remanence, or none at points where no number of points is given; it begins with the key `where`.
     """
     magnetic = case.magnetic
-    if magnetic is None or magnetic.remanent is None or not case.lambda_m:
-        raise CaseError(f"{where}: the case has no remanence in a field, so no result depends on it")
+    read = case.sensors or (magnetic and magnetic.interaction != "none")
+    if magnetic is None or magnetic.remanent is None or not (case.lambda_m or read):
+        raise CaseError(
+            f"{where}: the case has no remanence in a field, of a neighbour or that a sensor reads, so no result "
+            "depends on it"
+        )
     if count is None:
         if not (magnetic.remanent and magnetic.remanent.file):
             raise CaseError(f"{where}: give points, or magnetic.remanent of kind: points")

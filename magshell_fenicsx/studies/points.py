@@ -203,7 +203,7 @@ def identity(case: Case) -> str:
     """Hash of the problem: the resolved case, without a zero field, and its mesh file."""
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
-    if not (case.lambda_m or case.sensors or (magnetic and magnetic.interaction != "none")):
+    if not (case.lambda_m or case.sensors or case.field_maps or (magnetic and magnetic.interaction != "none")):
         del data["magnetic"]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 

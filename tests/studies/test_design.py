@@ -342,3 +342,27 @@ def test_letter_and_its_elastica(tmp_path: Path) -> None:
     finer = run(Case.load(tmp_path / "best.yaml", ["mesh.degree=3", "points={tip: [1, 0, 0]}"]))
     tip = np.array([1 + finer.rows[-1]["tip_ux"], finer.rows[-1]["tip_uz"]])
     np.testing.assert_allclose(solved.y[2:, -1], tip, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_remanence_for_a_sensor_that_reads_most(strip: Callable[[str], Path], tmp_path: Path) -> None:
+    """Far away the strip is a dipole m, e . B = m . (3 (x . e) x - e)/(4 pi r^3): most along that vector; to 1e-3."""
+    x, turned = np.array([30.0, 0.0, 20.0]), "design: {objective: {maximise: hall_Bz}, remanence: {points: 2}}\n"
+    text = "sensors: {hall: {position: [30.5, 0, 20]}}\nloading: {kind: pressure, control: load, until: target"
+    file = strip(f"{text}, pressure: 1.0e-9, points: 1}}\n{turned}")
+    file.write_text(file.read_text().replace("{lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}",
+                                             "{remanent: {polar: 90, flux_density: 1 T}}"))  # fmt: skip
+    content = design(file, ["design.iterations=20"], tmp_path / "out")
+    r, e = np.linalg.norm(x), np.array([0.0, 0.0, 1.0])
+    way, volume = (3 * (x @ e) * x / r**2 - e) / (4 * np.pi * r**3), 0.1 * 0.01
+    assert content["start"]["hall_Bz"] == pytest.approx(way[0] * volume, rel=2e-3)
+    assert content["best"]["hall_Bz"] == pytest.approx(np.linalg.norm(way) * volume, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_remanences_of_two_strips(tmp_path: Path) -> None:
+    """What pulls a strip down to another lifts it, by remanences found with the gradient of the interaction."""
+    content = design(CASES / "designed_neighbour.yaml", ["design.iterations=4"], tmp_path)
+    assert content["start"]["tip_uz_mm"] == pytest.approx(-0.575, abs=1e-3)
+    assert content["best"]["tip_uz_mm"] > 0.1
+    assert content["verified"]["tip_uz_mm"] == pytest.approx(content["best"]["tip_uz_mm"], rel=1e-6)

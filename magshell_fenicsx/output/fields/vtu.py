@@ -1,12 +1,13 @@
 """Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read them back."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import isnan, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 Array = NDArray[np.float64]
+Read = TypeVar("Read")
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
 FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
@@ -90,16 +92,27 @@ def unstructured_grid(surface: Surface, h: float, *, deformed: bool = False) -> 
     own = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
     fields = {name: f if f.ndim < 3 else f[:, *SYMMETRIC] for name, f in surface.fields.items()}
     for name, values in {**dict(zip(OWN_DATA, own, strict=True)), **fields}.items():
-        _give(grid.GetPointData(), name, values)
+        give(grid.GetPointData(), name, values)
     return grid
 
 
-def _give(to: Any, name: str, values: NDArray[Any]) -> None:
+def give(to: Any, name: str, values: NDArray[Any]) -> None:
     """Add an array to VTK's data of points, or of a file."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
     array.SetName(name)
+    to.AddArray(array)
+
+
+def give_texts(to: Any, name: str, lines: Sequence[str]) -> None:
+    """Add texts to VTK's data of a file."""
+    from vtkmodules.vtkCommonCore import vtkStringArray
+
+    array = vtkStringArray()
+    array.SetName(name)
+    for line in lines:
+        array.InsertNextValue(line)
     to.AddArray(array)
 
 
@@ -110,6 +123,17 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     ------
     CaseError
         If an earlier version wrote it, without the data of `About`, or it is damaged.
+    """
+    return read_grid(file, lambda grid: _surface(grid, file))
+
+
+def read_grid(file: Path, made: "Callable[[vtkUnstructuredGrid], Read]") -> "Read":
+    """What is made of the data of a .vtu file.
+
+    Raises
+    ------
+    Damaged
+        If it is damaged; whatever `made` raises of data that are missing says so.
     """
     from vtkmodules.vtkCommonCore import vtkObject
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
@@ -122,14 +146,14 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     vtkObject.GlobalWarningDisplayOff()  # the message follows
     try:
         reader.Update()
-        surface_and_about = _surface(reader.GetOutput(), file)
+        read = made(reader.GetOutput())
     except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
         raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     finally:
         vtkObject.SetGlobalWarningDisplay(shown)
     if errors or reader.GetErrorCode():
         raise Damaged(f"{file}: is damaged: VTK cannot read it")
-    return surface_and_about
+    return read
 
 
 def is_whole(file: Path) -> bool:
@@ -142,13 +166,17 @@ def is_whole(file: Path) -> bool:
         return b"<VTKFile" in head and stream.read().rstrip().endswith(b"</VTKFile>")
 
 
+def arrays(of: Any) -> dict[str, Array]:
+    """Name -> the numbers of VTK's data."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    named = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
+    return {name: vtk_to_numpy(array) for name, array in named if array}  # texts are no numbers
+
+
 def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     """What a grid of `unstructured_grid` has; whatever is raised, it is none."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    def arrays(of: Any) -> dict[str, Array]:
-        named = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
-        return {name: vtk_to_numpy(array) for name, array in named if array}  # texts are no numbers
 
     cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(grid.GetNumberOfCells(), -1)
     data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
@@ -179,6 +207,8 @@ class FieldSeries:
     ----------
     outlines
         Name of a point's file with the outlines of sources and bodies, of its number; empty without.
+    grids
+        Names of the grids with fields beside the shell; each has files and a list of its own.
     rows
         Those of the points that an interrupted run has written.
 
@@ -188,8 +218,15 @@ class FieldSeries:
         Number of leading points whose files are whole.
     """
 
-    def __init__(self, folder: Path, about: About, outlines: str = "", rows: Sequence[Mapping[str, Any]] = ()) -> None:
-        self._folder, self._about, self._outlines = folder, about, outlines
+    def __init__(
+        self,
+        folder: Path,
+        about: About,
+        outlines: str = "",
+        rows: Sequence[Mapping[str, Any]] = (),
+        grids: Sequence[str] = (),
+    ) -> None:
+        self._folder, self._about, self._outlines, self._grids = folder, about, outlines, grids
         folder.mkdir(exist_ok=True)
         self.kept = 0
         while all(map(is_whole, self._files(self.kept))):
@@ -199,8 +236,14 @@ class FieldSeries:
         if self.kept:
             self._write_list()
 
-    def write(self, number: int, surface: Surface, row: Mapping[str, Any] | None = None) -> None:
-        """Write a point's file; `row` is that of path.csv.
+    def write(
+        self,
+        number: int,
+        surface: Surface,
+        row: Mapping[str, Any] | None = None,
+        beside: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """Write a point's file; `row` is that of path.csv, `beside` the contents of the files of all grids.
 
         Raises
         ------
@@ -211,6 +254,8 @@ class FieldSeries:
             write_whole(
                 self._folder / self._outlines.format(number), vtp_content(surface.outlines, surface.solids), waits=False
             )
+        for name, content in beside.items():
+            write_whole(self._folder / grid_file(name, number), content, waits=False)
         write_whole(self._folder / point_file(number), vtu_content(surface, self._about), waits=False)
         self._rows.append(row or {"point": number})
         self._write_list()
@@ -218,14 +263,16 @@ class FieldSeries:
     def _files(self, number: int) -> list[Path]:
         """The files of a point."""
         names = [point_file(number), *([self._outlines.format(number)] if self._outlines else [])]
-        return [self._folder / name for name in names]
+        return [self._folder / name for name in (*names, *(grid_file(grid, number) for grid in self._grids))]
 
     def _write_list(self) -> None:
         numbers = [int(row["point"]) for row in self._rows]
-        names = [(n, [point_file(n), *([self._outlines.format(n)] if self._outlines else [])]) for n in numbers]
-        write_whole(
-            self._folder / "path.pvd", pvd_content(abscissae(self._rows), [files for _, files in names]), waits=False
-        )
+        at = abscissae(self._rows)
+        files = [[point_file(n), *([self._outlines.format(n)] if self._outlines else [])] for n in numbers]
+        write_whole(self._folder / "path.pvd", pvd_content(at, files), waits=False)
+        for grid in self._grids:
+            content = pvd_content(at, [[grid_file(grid, n)] for n in numbers])
+            write_whole(self._folder / f"map_{grid}.pvd", content, waits=False)
 
 
 def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
@@ -275,14 +322,16 @@ def point_file(number: int) -> str:
     return f"point_{number:04d}.vtu"
 
 
+def grid_file(name: str, number: int) -> str:
+    """The name of a point's file of a grid beside the shell."""
+    return f"map_{name}_{number:04d}.vtu"
+
+
 def vtu_content(surface: Surface, about: About) -> bytes:
     """The content of a .vtu file; VTK's own writer would ignore a full disk.
 
     LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more on curved surfaces.
     """
-    from vtkmodules.vtkCommonCore import vtkStringArray
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
     grid = unstructured_grid(surface, about.h)
     numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
@@ -290,17 +339,20 @@ def vtu_content(surface: Surface, about: About) -> bytes:
     numbers |= {"R_in_m": None if isnan(about.R) else np.array([about.R])}
     for name, values in numbers.items():
         if values is not None:
-            _give(grid.GetFieldData(), name, values)
+            give(grid.GetFieldData(), name, values)
     data = grid.GetPointData()
     names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
     texts = {"units": [f"{name}: {UNITS[name]}" for name in names if name in UNITS], SHELLS: surface.shells}
     for name, lines in texts.items():
-        array = vtkStringArray()
-        array.SetName(name)
-        for line in lines:
-            array.InsertNextValue(line)
         if lines or name != SHELLS:
-            grid.GetFieldData().AddArray(array)
+            give_texts(grid.GetFieldData(), name, lines)
+    return content_of(grid)
+
+
+def content_of(grid: "vtkUnstructuredGrid") -> bytes:
+    """The content of a .vtu file."""
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()

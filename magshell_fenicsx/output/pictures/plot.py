@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.fields.grids import read_map
 from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu, write_whole_shells
+from magshell_fenicsx.output.fields.vtu import About, grid_file, point_file, read_point, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
+from magshell_fenicsx.output.pictures.field_maps import field_maps_figure
 from magshell_fenicsx.output.pictures.layout import drawing, written
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
@@ -27,8 +29,10 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.output.store.written import note, refuse_unwritten
+from magshell_fenicsx.parts.seen import Grid
 
 MOST_PANELS = 12
+MAPS = "field_maps"  # key of the case with their names
 MOST_FRAMES = 40
 
 
@@ -76,6 +80,11 @@ class Drawn:
         if number not in self._points:
             self._points[number] = read_point(self.folder / "fields", number)
         return self._points[number]
+
+    def maps_at(self, row: Row) -> list[tuple[Grid, float]]:
+        """The grids beside the shell at a point, and R in metres."""
+        files = (self.folder / "fields" / grid_file(name, int(row["point"])) for name in self.resolved.get(MAPS) or ())
+        return [read_map(file) for file in files]
 
 
 def plot(
@@ -181,6 +190,9 @@ def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
         in_its_field(surface, run.rows[point], run.rows), about.h, run.style, run.camera
     ).items():
         yield from written(figure, run.style, f"{name}_{point:04d}")
+    if maps := run.maps_at(run.rows[point]):
+        figure = field_maps_figure(maps, surface, about.h, run.resolved, run.style)
+        yield from written(figure, run.style, f"field_maps_{point:04d}")
 
 
 def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
@@ -198,6 +210,8 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
             yield from written(readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors")
     for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
+    if maps := run.maps_at(run.headline):
+        yield from written(field_maps_figure(maps, surface, about.h, run.resolved, style), style, "field_maps")
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
         yield from written(figure, style, name)
     if frequencies := read_frequencies(run.folder):

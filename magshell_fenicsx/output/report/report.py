@@ -39,6 +39,7 @@ FOLDED = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
     "curve.png": "Load over displacement; dashed where the shell is unstable.",
     "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
+    "field_maps.png": "The magnetic field beside the shell at the last point: field lines and |B|.",
     "solutions.png": "The end of the path, and the solutions that the search has found.",
     "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
     "animation.gif": "The shell along the path.",

@@ -18,12 +18,12 @@ FIRST = "# files that magshell_fenicsx has written here: another run replaces th
 MESH = "mesh.json"  # the mesh chosen for a tolerance
 OF_PATH = (checkpoint.NAME, "path.csv", MESH)
 NEW = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
-DRAWN = (*PICTURES, "curve", "sensors", "instabilities", "modes", "frequencies", "solutions", "gradients")
+DRAWN = (*PICTURES, "curve", "sensors", "field_maps", "instabilities", "modes", "frequencies", "solutions", "gradients")
 # every name that a run, or `plot` after it, may write, also while it writes
 NAMES = re.compile(
     r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"
     rf"|({'|'.join(DRAWN)})(_\d{{4,}})?\.(png|svg|pdf)"
-    r"|fields(/((path|whole)\.pvd|outlines(_\d{4,})?\.vtp|((point|whole)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
+    r"|fields(/((path|whole)\.pvd|outlines(_\d{4,})?\.vtp|map_.+\.pvd|((point|whole|map_.+)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
 )
 
 

@@ -25,17 +25,28 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 POINTS, LAYERS = 6, 6  # of Gauss's rules in a box, and of the charges through the thickness
 FAR, MOST = 2.5, 40  # radii of a box that a place is away from it, and halvings at most
-CHUNK = 40_000  # points that are found at once
+CHUNK, PAIRS = 40_000, 200_000  # points that are found at once, and pairs of a charge and a place
 SECTORS = 8  # of a meridian's ring
 AROUND, TINY, SMALL = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 1e-6, 1e-4  # corners of a box, and what has no area
-GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # of a box
-FEET, NEWTON, BESIDE = 12, 15, 1e-6  # boxes near a place, steps to its foot there, and over R
+SIDE = 9
+GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, SIDE)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # of a box
+NEWTON, BESIDE = 15, 1e-6  # steps to the foot of a place in a box, and over R
 INSIDE = 1e-3  # of a box, as at a corner it may have no normal
 SEEN = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5], [0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]])  # of its square
 
 
 class TooNear(ValueError):
-    """A place is on the surface of the shell, or in it."""
+    """Places are on the surface of the shell, or in it.
+
+    Attributes
+    ----------
+    of
+        Their numbers.
+    """
+
+    def __init__(self, of: Ints) -> None:
+        super().__init__(of)
+        self.of = of
 
 
 @cache
@@ -114,27 +125,36 @@ class Family:
         """Charges at points x (m, 2) of the unit square times weights (m,)."""
         raise NotImplementedError
 
-    def near(self, places: Array) -> Iterator[tuple[Boxes, Ints]]:
-        """Boxes, and for each the place it is to be seen from; far enough."""
+    def near(self, places: Array) -> Iterator[tuple[Boxes, Ints, Ints]]:
+        """Boxes, and pairs of the number of one of them and of the place from which it is seen; far enough.
+
+        Each box is found once for all places.
+
+        Raises
+        ------
+        TooNear
+            If a place is in the shell's surface, when all others have their boxes.
+        """
         corners = np.clip(SEEN, INSIDE, 1 - INSIDE)
-        boxes, of = Boxes.whole(self.count), np.arange(len(places))
-        seen, where = boxes[np.tile(np.arange(self.count), len(places))], np.repeat(of, self.count)
+        boxes, where = Boxes.whole(self.count), np.repeat(np.arange(len(places)), self.count)
+        which = np.tile(np.arange(self.count), len(places))
         for _ in range(MOST):
-            if not len(seen.of):
+            if not len(which):
                 return
-            x = self.middle(seen, corners)
-            centre, spread = x[:, 4], np.abs(x - x[:, 4:5])
-            radius = np.sqrt((spread**2).sum(axis=-1)).max(axis=(1, 2))
-            gap = np.linalg.norm(places[where][:, None] - centre, axis=-1).min(axis=-1)
-            far = gap > FAR * radius
+            x = self.middle(boxes, corners)
+            centre = x[:, 4]
+            radius = np.sqrt(((x - x[:, 4:5]) ** 2).sum(axis=-1)).max(axis=(1, 2))
+            gap = np.linalg.norm(places[where][:, None] - centre[which], axis=-1).min(axis=-1)
+            far = gap > FAR * radius[which]
             if far.any():
-                yield seen[far], where[far]
-            seen, where, x = seen[~far], where[~far], x[~far]
+                yield boxes, which[far], where[far]
+            halved, which = np.unique(which[~far], return_inverse=True)
+            where, x = where[~far], x[halved]
             sides = [np.linalg.norm(x[:, i] - x[:, j], axis=-1).max(axis=-1) for i, j in ((7, 8), (5, 6))]
-            along = (sides[1] > sides[0]).astype(np.intp)
-            seen, where = seen.halves(along), np.tile(where, 2)
-        if len(seen.of):
-            raise TooNear
+            boxes = boxes[halved].halves((sides[1] > sides[0]).astype(np.intp))
+            which, where = np.concatenate([which, which + len(halved)]), np.tile(where, 2)
+        if len(which):
+            raise TooNear(np.unique(where))
 
 
 class Faces(Family):
@@ -163,15 +183,33 @@ class Faces(Family):
         at = self._jets(boxes, x)
         return np.stack([at.place(0.5), at.place(-0.5)], axis=2)
 
-    def holds(self, x: Array) -> bool:
-        """Whether a place (3,) is in the shell: the foot on the mid-surface is within half of the thickness."""
+    def holds(self, places: Array) -> NDArray[np.bool_]:
+        """Which of places (n, 3) are in the shell: the foot on the mid-surface is within half of the thickness."""
+        from scipy.spatial import cKDTree  # takes long to import
+
+        held = np.zeros(len(places), dtype=bool)
+        if not self.count:
+            return held
         boxes, start = Boxes.whole(self.count), np.clip(GRID, INSIDE, 1 - INSIDE)
-        at = self._jets(boxes, start)
-        away = np.linalg.norm(x - at.r[0], axis=-1)
-        near = np.argsort(away.min(axis=1))[:FEET]
-        if not len(near) or away[near[0]].min() > np.ptp(at.r[0][near[0]], axis=0).max() + at.t[0][near[0]].max():
-            return False
-        boxes, ab = boxes[near], start[away[near].argmin(axis=1)][:, None]
+        grid = self._jets(boxes, start)
+        square = grid.r[0].reshape(-1, SIDE, SIDE, 3)
+        across = [square[:, 1:, 1:] - square[:, :-1, :-1], square[:, 1:, :-1] - square[:, :-1, 1:]]
+        reach = np.max([np.linalg.norm(each, axis=-1).max(axis=(1, 2)) for each in across], axis=0)
+        reach = reach + grid.thickness.max(axis=1)
+        beside = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
+        of = np.repeat(np.arange(len(places)), [len(each) for each in beside])
+        near, point = np.divmod(np.concatenate([*beside, []]).astype(np.intp), len(start))
+        away = np.linalg.norm(places[of] - grid.r[0][near, point], axis=-1)
+        order = np.lexsort((away, near, of))
+        order = order[away[order] <= reach[near[order]]]
+        _, first = np.unique(of[order] * self.count + near[order], return_index=True)  # the nearest in each box
+        of, near, point = (each[order][first] for each in (of, near, point))
+        if len(of):
+            held[of[self._feet_within(boxes[near], start[point][:, None], places[of][:, None])]] = True
+        return held
+
+    def _feet_within(self, boxes: Boxes, ab: Array, x: Array) -> NDArray[np.bool_]:
+        """Whether places (n, 1, 3) have a foot in a box within half of the thickness; Newton's method from `ab`."""
         for _ in range(NEWTON):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
@@ -182,7 +220,7 @@ class Faces(Family):
         d, n = x - foot.r[0], unit(np.cross(foot.r[1], foot.r[2]))
         across = np.sum(d * n, axis=-1)
         beside = np.linalg.norm(d - across[..., None] * n, axis=-1)
-        return bool(((np.abs(across) <= foot.thickness / 2) & (beside < BESIDE)).any())
+        return np.asarray((np.abs(across) <= foot.thickness / 2) & (beside < BESIDE))[:, 0]
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at = self._jets(boxes, x)
@@ -269,19 +307,31 @@ def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], i
 
 
 def field(families: Sequence[Family], places: Array) -> Array:
-    """B (n, 3) at places (n, 3), of these charges.
-
-    Raises
-    ------
-    TooNear
-        If one is in the shell's surface.
-    """
-    B = np.zeros_like(places)
-    for at, of, _ in _seen(families, places, None):
-        d = places[of][:, None, None] - at.x
-        r = np.linalg.norm(d, axis=-1)
-        np.add.at(B, of, np.sum((at.q / r**3)[..., None] * d, axis=(1, 2)) / (4 * np.pi))
+    """B (n, 3) at places (n, 3), of these charges; nan in the shell's surface."""
+    B, (rule, weights) = np.zeros_like(places), square(POINTS)
+    for family in families:
+        for some in _parts(len(places), family.count):
+            try:
+                for boxes, which, where in family.near(places[some]):
+                    used, which = np.unique(which, return_inverse=True)
+                    at = [family.at(part, rule, weights) for part in _chunks(boxes[used], len(weights))]
+                    x = np.concatenate([each.x for each in at]).reshape(len(used), -1, 3)
+                    q = np.concatenate([each.q for each in at]).reshape(len(used), -1)
+                    _add_field(B[some], where, places[some], x, q, which)
+            except TooNear as near:
+                B[some][near.of] = np.nan
     return B
+
+
+def _add_field(B: Array, where: Ints, places: Array, x: Array, q: Array, which: Ints) -> None:
+    """Add to B (n, 3) at places `where` that of charges (boxes, points) of boxes `which`."""
+    components = np.ascontiguousarray(np.moveaxis(x, -1, 0))
+    for some in _parts(len(where), q.shape[1]):
+        d = [places[where[some], i, None] - components[i][which[some]] for i in range(3)]
+        square_of_distance = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        share = q[which[some]] / (4 * np.pi * square_of_distance * np.sqrt(square_of_distance))
+        for i in range(3):
+            B[:, i] += np.bincount(where[some], np.einsum("nm,nm->n", share, d[i]), len(B))
 
 
 def gradient(families: Sequence[Family], place: Array, e: Array, into: Nodal) -> float:
@@ -290,10 +340,18 @@ def gradient(families: Sequence[Family], place: Array, e: Array, into: Nodal) ->
     Raises
     ------
     TooNear
-        As `field`.
+        If it is in the shell's surface.
     """
     value = 0.0
-    for at, _, _ in _seen(families, place[None], into):
+    rule, weights = square(POINTS)
+    parts = (
+        (family, part)
+        for family in families
+        for boxes, which, _ in family.near(place[None])
+        for part in _chunks(boxes[which], len(weights))
+    )
+    for family, part in parts:
+        at = family.at(part, rule, weights, into)
         d = place - at.x
         r = np.linalg.norm(d, axis=-1)
         kernel = d @ e / (4 * np.pi * r**3)
@@ -328,13 +386,10 @@ def _chunks(boxes: Boxes, points: int) -> Iterator[Boxes]:
         yield boxes[first : first + each]
 
 
-def _seen(families: Sequence[Family], places: Array, into: Nodal | None) -> Iterator[tuple[Found, Ints, Boxes]]:
-    rule, weights = square(POINTS)
-    for family in families:
-        for boxes, of in family.near(places):
-            for first in range(0, len(of), max(1, CHUNK // len(weights))):
-                some = slice(first, first + max(1, CHUNK // len(weights)))
-                yield family.at(boxes[some], rule, weights, into), of[some], boxes[some]
+def _parts(count: int, each: int) -> Iterator[slice]:
+    """So many things, `each` of which has so many points, in parts of about `PAIRS` points."""
+    size = max(1, PAIRS // max(each, 1))
+    return (slice(first, first + size) for first in range(0, count, size))
 
 
 def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:

@@ -18,7 +18,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charged import Shape
+from magshell_fenicsx.parts.magnetism.by_charges import STEP, Weights, add
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
@@ -53,9 +54,11 @@ class Touching(ValueError):
 class Kind:
     """The faces of all cells, or their edges with one local number that are charged."""
 
-    def __init__(self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None) -> None:
+    def __init__(
+        self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None, *, may: bool = False
+    ) -> None:
         self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
-        self.family = Faces(shape, cells) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
+        self.family = Faces(shape, cells, may=may) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
         count = len(copies.images)
         self.cells = np.concatenate([cells + copy * len(shape.r0) for copy in range(count)])
         self.number = np.full(count * len(shape.r0), -1)
@@ -72,21 +75,38 @@ class Kind:
         return float(np.abs(self.rule(which).q).max(initial=0.0))
 
     def _face(self, which: int) -> Points:
-        X, w = basix.make_quadrature(basix.CellType.triangle, DEGREES[which])
-        ab = np.stack([X[:, 0], X[:, 1] / (1 - X[:, 0])], axis=-1)
-        q = self.family.at(Boxes.whole(self.family.count), ab, np.array(w / (1 - X[:, 0]), dtype=np.float64)).q
+        X, ab, weights = self._on_face(which)
+        q = self.family.at(Boxes.whole(self.family.count), ab, weights).q
         assert isinstance(self.family, Faces)
         return self._made(X, heights(self.family), q)
 
+    def _on_face(self, which: int) -> tuple[Array, Array, Array]:
+        """Points of the reference triangle, their coordinates (a, b), and weights."""
+        X, w = basix.make_quadrature(basix.CellType.triangle, DEGREES[which])
+        ab = np.stack([X[:, 0], X[:, 1] / (1 - X[:, 0])], axis=-1)
+        return X, ab, np.array(w / (1 - X[:, 0]), dtype=np.float64)
+
     def _side(self, which: int) -> Points:
+        s, eta, points, weights = self._on_side(which)
+        q = self.family.at(Boxes.whole(self.family.count), points, weights).q.reshape(-1, len(s), len(eta))
+        X = [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][self._edge or 0]
+        return self._made(X, eta - 0.5, q)
+
+    def _on_side(self, which: int) -> tuple[Array, Array, Array, Array]:
+        """Coordinates along the edge and through the thickness, all pairs of these, and weights."""
         s, ws = gauss((DEGREES[which] + 2) // 2)
         eta, we = gauss(2 + which)
         points = np.stack(np.meshgrid(s, eta, indexing="ij"), axis=-1).reshape(-1, 2)
-        q = self.family.at(
-            Boxes.whole(self.family.count), points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
-        ).q.reshape(-1, len(s), len(eta))
-        X = [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][self._edge or 0]
-        return self._made(X, eta - 0.5, q)
+        return s, eta, points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
+
+    def back(self, which: int, on_q: Array, into: Nodal) -> None:
+        """From derivatives by the charges of a rule, those by the remanence."""
+        count, boxes = len(self._copies.images), Boxes.whole(self.family.count)
+        on = np.einsum("c,c...->...", self._copies.charges, on_q.reshape(count, -1, *on_q.shape[1:]))
+        at = self._on_face(which)[1:] if self._edge is None else self._on_side(which)[2:]
+        made = self.family.at(boxes, *at, into)
+        assert made.back
+        made.back(np.zeros_like(made.x), on.reshape(made.q.shape))
 
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
@@ -109,6 +129,8 @@ class Charged:
         Edges that may be charged, by cell and local number.
     near
         The pairs of cells that touch, where each part acts on itself too; None where it does not.
+    may
+        Whether what has no charge may get one.
     """
 
     def __init__(
@@ -120,12 +142,14 @@ class Charged:
         comm: MPI.Comm,
         near: Near | None = None,
         copies: Copies = ALL,
+        *,
+        may: bool = False,
     ) -> None:
-        self._pairs, self._h, self._near = Pairs(comm), shape.h, near
-        kinds = [Kind(shape, np.arange(len(shape.r0)), copies)]
+        self._pairs, self._h, self._near, self._shape = Pairs(comm), shape.h, near, shape
+        kinds = [Kind(shape, np.arange(len(shape.r0)), copies, may=may)]
         kinds += [Kind(shape, cells[edges == edge], copies, edge) for edge in range(3) if (edges == edge).any()]
         sizes = [kind.charged(0) for kind in kinds]
-        self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if size > NOTHING * max(sizes)]
+        self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if may or size > NOTHING * max(sizes)]
         self._apart = np.array(parts[:, None] != parts, dtype=np.uint8)
         for cell, others in enumerate(near.touching if near else ()):
             self._apart[cell] = 1
@@ -205,6 +229,34 @@ class Charged:
         if stiffness:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
+
+    def by_remanence(self, nodes: Array, rates: Array, own: range, weights: Weights) -> Array:
+        """Derivatives (cells, nodes, 3) by the remanence of a part of the energy and of its rate along `rates`.
+
+        The energy is that of `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
+
+        Raises
+        ------
+        Touching
+            See `rules`.
+        """
+        rules, moved = self.rules(nodes, own), nodes + STEP * 1j * rates
+        into = Nodal(np.zeros_like(self._shape.r0), np.zeros_like(self._shape.remanence))
+        far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
+        for kind, on_q in zip(self._kinds, far.by_charges(nodes, moved, cells_far, weights), strict=True):
+            kind.back(FAR, on_q, into)
+        first, second = np.nonzero(rules >= 0)
+        which, first = rules[first, second], first + own.start
+        for number in map(int, np.unique(which)):
+            cells = np.column_stack([first, second])[which == number]
+            for one, other in product(self._kinds, self._kinds):
+                one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
+                charged = (one_row >= 0) & (other_row >= 0)
+                left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
+                one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
+        if self._near:
+            self._near.by_remanence(moved, weights, into)
+        return into.by_remanence
 
 
 def _balls(nodes: Array) -> tuple[Array, Array]:

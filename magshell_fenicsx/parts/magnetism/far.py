@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
+from magshell_fenicsx.parts.magnetism.by_charges import STEP, Complex, Weights, places
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
@@ -89,9 +90,7 @@ class Far:
 
     def add(self, at: Placed, *, bent: bool) -> float:
         """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go to points' sums."""
-        M = np.zeros((len(self._leaf.keys), COUNT, 1))
-        M[self._filled, :, 0] = np.add.reduceat(self._q * at.Y, self._first, axis=1).T
-        N, L = derivatives(), self.onto(M)[..., 0]
+        N, L = derivatives(), self.onto(self._summed(self._q * at.Y))[..., 0]
         slopes = [*N, *(N[i] @ N[j] for i, j in SECOND)] if bent else N
         of_box = np.stack([L, *(L @ each for each in slopes)], axis=-1)
         values = np.empty((len(self._q), of_box.shape[-1]))
@@ -108,6 +107,36 @@ class Far:
             sums = np.concatenate([part.sum(axis=2) for part in parts], axis=-1)
             points.sums[own, :, : sums.shape[-1]] += sums
         return float(energy)
+
+    def by_charges(
+        self, nodes: Array, moved: Complex, kinds: Sequence[tuple[Ints, Points]], weights: Weights
+    ) -> list[Array]:
+        """Derivatives of the energy of all, and of its rate, by the charges of own cells, like `Points.q` of each kind.
+
+        Parameters
+        ----------
+        moved
+            (cells, k, 3) the nodes, with rates times `STEP` as imaginary parts.
+        """
+        Y, N, width = self.placed(nodes).Y, derivatives(), self._leaf.width
+        x = [places(points, np.arange(len(points.q)), moved[cells])[2].reshape(-1, 3) for cells, points in kinds]
+        rate = np.concatenate(x)[self._order].imag / STEP / width
+        dY = rate[:, 0] * (N[0] @ Y) + rate[:, 1] * (N[1] @ Y) + rate[:, 2] * (N[2] @ Y)
+        L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
+        by_q = np.empty(len(self._q))
+        for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
+            y, dy = Y[:, first:end], dY[:, first:end]
+            at = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
+            by_q[self._order[first:end]] = at / width
+        parts = np.split(by_q, np.cumsum([points.q.size for _, points in kinds])[:-1])
+        shaped = [part.reshape(points.q.shape) for part, (_, points) in zip(parts, kinds, strict=True)]
+        return [part * own[:, None, None] for part, own in zip(shaped, self._own, strict=True)]
+
+    def _summed(self, values: Array) -> Array:
+        """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of boxes."""
+        M = np.zeros((len(self._leaf.keys), COUNT, 1))
+        M[self._filled, :, 0] = np.add.reduceat(values, self._first, axis=1).T
+        return M
 
     def onto(self, M: Array) -> Array:
         """L = G M times the width, of the boxes (boxes, COUNT, n) of the finest level."""

@@ -242,7 +242,9 @@ class MagneticSection(Section, Ability):
 
     def refuse_unfit(self, context: Context) -> None:
         """See that its field has a strength, and that the shell has what its energies need."""
-        shell, sensors = context.shell, context.sections.get("sensors")
+        from magshell_fenicsx.parts.magnetism.sensors import is_read  # it needs this section
+
+        shell = context.shell
         self.amplitude(shell.youngs_modulus)
         if self.applied.sources and not shell.with_units:
             raise ValueError(
@@ -254,7 +256,7 @@ class MagneticSection(Section, Ability):
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
                 "or lambda_m"
             )
-        if self.without_field and not sensors and self.interaction == "none":
+        if self.without_field and not is_read(context) and self.interaction == "none":
             raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.interaction != "none":
             context.needs(
@@ -293,9 +295,10 @@ class MagneticSection(Section, Ability):
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.sensors import is_read
 
         acts = [] if self.interaction == "none" else [Leaves("parts act on each other")]
-        seen = strength(context) or context.sections.get("sensors") or acts
+        seen = strength(context) or is_read(context) or acts
         return acts + (leaves(context, outline) if seen else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.magnetism.by_charges import Weights
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
@@ -123,6 +124,21 @@ class InteractionTerm:
             self._stiff = nodes, self._acting_at(nodes)
         return self._stiff[1]
 
+    def by_field(self, direction: fem.Function, energy: float, force: float) -> tuple[fem.Function, Array]:
+        """The remanence, and the derivatives by it; see `assembly.coupled.KnowsFields`; collective."""
+        own = own_field(self._sight)
+        nodes, rates = self._nodes(), whole(direction)[self._cells.nodes]
+        turned = [rates @ image.Q.T for image in self._copies.images]
+        shape, cells, edges = self._all(may=True)
+        near = Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies, may=True)
+        charged = Charged(
+            shape, self._parts, cells, edges, self._comm, near if self._itself else None, self._copies, may=True
+        )
+        weights = Weights(self._scale * energy, self._scale * force)
+        found = charged.by_remanence(nodes, np.concatenate(turned), self._cells.own, weights)
+        own_cells = slice(self._cells.own.start, self._cells.own.stop)
+        return own.Br, np.asarray(self._comm.allreduce(found))[own_cells]
+
     def _acting_at(self, nodes: Array) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
         own, images, V = self._cells.own, self._copies.images, self._u.function_space
         count, several = V.dofmap.index_map.size_global, len(images) > 1
@@ -185,10 +201,10 @@ class InteractionTerm:
             return None
         return Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies)
 
-    def _all(self) -> tuple[Shape, Ints, Ints]:
-        """The cells of all ranks, and their edges that may be charged; collective."""
+    def _all(self, *, may: bool = False) -> tuple[Shape, Ints, Ints]:
+        """The cells of all ranks, and their edges that are charged, or `may` be by any remanence; collective."""
         own = own_field(self._sight)
-        shape, (cells, edges) = own.shape({}), own.edges
+        shape, (cells, edges) = own.shape({}), own.chargeable if may else own.edges
         thick = shape.thick and (shape.thick[0], self._cells.gathered(shape.thick[1]))
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
         everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)

@@ -23,6 +23,7 @@ from magshell_fenicsx.models.shell.patterns import (
     tangential,
 )
 from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.field_maps import field_maps
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.interaction import interaction
@@ -233,7 +234,8 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
-    read = {"sensors": sensors(context, turn), "interaction": interaction(context)}
+    read: dict[str, Any] = {"sensors": sensors(context, turn), "field_maps": field_maps(context, turn)}
+    read["interaction"] = interaction(context)
     if FieldSection.amplitude in driven:
         to = [step.to for step in _rotations(context)]
         return {"magnetic": magnetisation(magnetic, context, turn, within, to), **read}

@@ -15,8 +15,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charged import Shape
-from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Found, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.touching import (
     APART,
@@ -77,12 +78,16 @@ class Batch:
     ----------
     own
         How many of the first pairs have their first cell on this rank.
+    of_left, of_right
+        Where the charges are found, with the local edges of strips, and what these are multiplied by.
     """
 
     pairs: Ints
     own: int
     left: Points
     right: Points
+    of_left: tuple[Places, int | None, float]
+    of_right: tuple[Places, int | None, float]
 
 
 class Near:
@@ -98,6 +103,8 @@ class Near:
         Edges that may be charged, by cell and local number.
     own
         The cells of this rank; pairs without one of them are left to others.
+    may
+        Whether what has no charge may get one.
     """
 
     def __init__(
@@ -109,15 +116,17 @@ class Near:
         own: range,
         comm: MPI.Comm,
         copies: Copies = ALL,
+        *,
+        may: bool = False,
     ) -> None:
-        self._pairs, self._copies = Pairs(comm), copies
+        self._pairs, self._copies, self._may = Pairs(comm), copies, may
         self._shape, self._corners, self._own = shape, corners, own
         strips = np.zeros((len(shape.r0), 3), dtype=bool)
         strips[cells, edges] = True
         self._strips = np.tile(strips, (len(copies.images), 1))
         sides = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
         self._scale = float(shape.h / np.median(sides))
-        self._heights = heights(Faces(shape, np.arange(1)))
+        self._heights = heights(Faces(shape, np.arange(1), may=may))
         meeting: dict[int, list[int]] = {}
         numbers = [[int(each) for each in corners[cell]] for cell in range(len(corners))]
         for cell, three in enumerate(numbers):
@@ -202,7 +211,7 @@ class Near:
             made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
         most = max((float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0)
         for each in made:
-            if all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
+            if self._may or all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
                 yield each
 
     def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
@@ -220,7 +229,9 @@ class Near:
                 q.reshape(len(q), count, -1, h.shape[-1]),
             )
         share = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
-        return Batch(pairs, own, Points(left[0], left[1], left[2], share * left[3]), Points(T, h, t, q))
+        left_points = Points(left[0], left[1], left[2], share * left[3])
+        of = (first, kind[1] if kind[0] != "faces" else None, share), (second, kind[3] if on_strips else None, 1.0)
+        return Batch(pairs, own, left_points, Points(T, h, t, q), *of)
 
     def _rules(self, kind: Kind) -> tuple[Places, Places, bool]:
         """Points of both elements; of the second one those for each of the first, or, if true, the same for all."""
@@ -262,37 +273,74 @@ class Near:
         up, charge = (each[copy][:, None] for each in (self._copies.up, self._copies.charges))
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
         t = up * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
+        basis = _basis(points)
         if points.at is None:
-            q = np.einsum("mj,njl->nml", NODES.tabulate(0, X)[0, :, :, 0], self._on_faces[cells], optimize=True)
+            q = np.einsum("mj,njl->nml", basis, self._on_faces[cells], optimize=True)
             layers = np.broadcast_to(self._heights, (len(X), len(self._heights)))
         else:
             assert edge is not None
-            basis = np.einsum("ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP)))
-            basis = basis.reshape(len(X), -1)
             q, layers = (self._on_strips[edge][cells] @ basis.T)[..., None], points.at[:, 1:] - 0.5
         return T, np.ascontiguousarray(layers), np.ascontiguousarray(t), points.weights[:, None] * charge[..., None] * q
 
     @cached_property
     def _on_faces(self) -> Array:
         """(cells, n, layers) charges per area of the reference triangle at nodes of what is modelled."""
+        return np.concatenate([found.q for _, found in self._found_on_faces(None)])
+
+    def _found_on_faces(self, into: Nodal | None) -> Iterator[tuple[Ints, Found]]:
         X, cells = NODES.points, np.arange(len(self._shape.r0))
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         each = max(1, CHUNK // len(X))
-        parts = [cells[first : first + each] for first in range(0, len(cells), each)]
-        return np.concatenate([Faces(self._shape, part).at(Boxes.whole(len(part)), ab, weights).q for part in parts])
+        for part in (cells[first : first + each] for first in range(0, len(cells), each)):
+            yield part, Faces(self._shape, part, may=self._may).at(Boxes.whole(len(part)), ab, weights, into)
 
     @cached_property
     def _on_strips(self) -> list[Array]:
         """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
+        charges: list[Array] = [np.zeros((len(self._shape.r0), int(np.prod(ON_STRIP)))) for _ in range(3)]
+        for edge, cells, found in self._found_on_strips(None):
+            charges[edge][cells] = found.q[..., 0]
+        return charges
+
+    def _found_on_strips(self, into: Nodal | None) -> Iterator[tuple[int, Ints, Found]]:
         (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
         at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
-        charges: list[Array] = [np.zeros((len(self._shape.r0), len(at))) for _ in range(3)]
-        for edge, of_edge in enumerate(charges):
+        for edge in range(3):
             cells = np.flatnonzero(self._strips[: len(self._shape.r0), edge])
             if len(cells):
                 sides = Sides(self._shape, cells, np.full(len(cells), edge))
-                of_edge[cells] = sides.at(Boxes.whole(len(cells)), at, np.ones(len(at))).q[..., 0]
-        return charges
+                yield edge, cells, sides.at(Boxes.whole(len(cells)), at, np.ones(len(at)), into)
+
+    def by_remanence(self, moved: Complex, weights: Weights, into: Nodal) -> None:
+        """Add the derivatives by the remanence: see `Charged.by_remanence`."""
+        on_faces, on_strips = np.zeros_like(self._on_faces), [np.zeros_like(each) for each in self._on_strips]
+        for batch in self._batches:
+            pairs = batch.pairs[: batch.own]
+            rows = np.arange(len(pairs))
+            sides = zip((0, 1), (batch.of_left, batch.of_right), strict=True)
+            on_q = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights)
+            for i, (points, edge, share) in sides:
+                copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
+                on = on_q[i][: len(pairs)].reshape(len(pairs), len(points.weights), -1)
+                on = share * points.weights[:, None] * self._copies.charges[copy][:, None, None] * on
+                if edge is None:
+                    np.add.at(on_faces, cells, np.einsum("mj,nml->njl", _basis(points), on, optimize=True))
+                else:
+                    np.add.at(on_strips[edge], cells, on[..., 0] @ _basis(points))
+        for part, found in self._found_on_faces(into):
+            assert found.back
+            found.back(np.zeros_like(found.x), on_faces[part])
+        for edge, cells, found in self._found_on_strips(into):
+            assert found.back
+            found.back(np.zeros_like(found.x), on_strips[edge][cells][..., None])
+
+
+def _basis(points: Places) -> Array:
+    """(m, n) values at points of the polynomials that are one at one of the nodes each at which charges are found."""
+    if points.at is None:
+        return np.asarray(NODES.tabulate(0, points.X)[0, :, :, 0])
+    basis = np.einsum("ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP)))
+    return np.asarray(basis.reshape(len(points.X), -1))
 
 
 def _lagrange(n: int, x: Array) -> Array:

@@ -1,6 +1,7 @@
 """The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, place
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
-from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, TooNear, field, gradient, moment, triangles
+from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.seen import Sight
@@ -69,22 +70,24 @@ class OwnField:
     def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
         """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
         shape = self.shape(mu)
-        cells, edges = self._sides(every=True) if may else self.edges
+        cells, edges = self.chargeable if may else self.edges
         faces = Faces(shape, np.arange(self._owned), may=may)
         return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
 
-    def B(self, families: Sequence[Family], mu: Mapping[str, float], x: Array) -> Array:
-        """The field (3,) at a place, of a remanence of length one; nan in the shell; collective."""
-        try:
-            images = [image.back(x) for image in self._images]
-            if any(family.holds(each) for family in families if isinstance(family, Faces) for each in images):
-                raise TooNear
-            total = np.zeros(3)
-            for image in self._images:
-                sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
-                total = total + sign * image.Q @ field(families, image.back(x)[None])[0]
-        except TooNear:
-            total = np.full(3, np.nan)
+    @cached_property
+    def chargeable(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """As `edges`, all that any remanence may charge."""
+        return self._sides(every=True)
+
+    def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
+        """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell; collective."""
+        total, faces = np.zeros_like(places), [family for family in families if isinstance(family, Faces)]
+        for image in self._images:
+            seen_from, sign = image.back(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
+            held = np.logical_or.reduce([family.holds(seen_from) for family in faces])
+            total[held] = np.nan
+            out = ~np.isnan(total[:, 0])
+            total[out] += sign * field(families, seen_from[out]) @ image.Q.T
         return np.asarray(self._model.system.comm.allreduce(total))
 
     def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:

@@ -108,8 +108,8 @@ class SensorsSeen(Seen):
         if not sight.loads.sensors:
             return {}
         readings = self._readings(sight, state, sight.loads.sensors)
-        pairs = zip(sight.loads.sensors, readings, strict=True)
-        return {column: float(B) for each, row in pairs for column, B in zip(each.columns, row, strict=True)}
+        columns = [column for each in sight.loads.sensors for column in each.columns]
+        return dict(zip(columns, map(float, readings.ravel()), strict=True))
 
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
@@ -154,23 +154,32 @@ class SensorsSeen(Seen):
         value = float(self._readings(sight, state, [sensor])[0][i])
         return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
 
-    def _readings(self, sight: Sight, state: "State", of: Sequence[Sensor]) -> list[Array]:
-        """(3,) of each, in the case's frame."""
-        from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
+    def _readings(self, sight: Sight, state: "State", of: Sequence[Sensor]) -> Array:
+        """(n, 3) of each, in the case's frame."""
+        places, total = np.array([each.place for each in of]), np.array([each.total for each in of])
+        own, applied = (np.array([getattr(each, name) for each in of])[:, None] for name in ("own", "applied"))
+        return field_at(sight, state, places, own, np.where(total[:, None], applied, 0.0))
 
-        Q = rotation(sight.azimuth)
 
-        def present() -> list[Array]:
-            if magnetised(sight.loads) is None:
-                return [np.zeros(3) for _ in of]
-            own = own_field(sight)
-            _, families = own.families(state.mu)
-            return [each.own * own.B(families, state.mu, each.place) for each in of]
+def field_at(sight: Sight, state: "State", places: Array, own: Array | float, applied: Array | float) -> Array:
+    """The field (n, 3) at places (n, 3) over R of the model's frame, in the frame of the case; collective.
 
-        fields, applied = sight.model.system.at(state).of(present), sight.loads.magnetic
-        if applied:
-            fields = [
-                B + each.applied * applied.at(state.mu, each.place[None])[0] if each.total else B
-                for each, B in zip(of, fields, strict=True)
-            ]
-        return [B @ Q for B in fields]
+    It is nan in the shell.
+
+    Parameters
+    ----------
+    own, applied
+        What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n, 1), or of all.
+    """
+    from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
+
+    def present() -> Array:
+        if magnetised(sight.loads) is None:
+            return np.zeros_like(places)
+        shell = own_field(sight)
+        return own * shell.B(shell.families(state.mu)[1], state.mu, places)
+
+    B, outside = sight.model.system.at(state).of(present), sight.loads.magnetic
+    if outside and np.any(applied):
+        B = B + applied * outside.at(state.mu, places)
+    return np.asarray(B @ rotation(sight.azimuth))

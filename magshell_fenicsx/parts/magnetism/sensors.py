@@ -94,11 +94,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
 
     def refuse_unfit(self, context: Context) -> None:
         """See that something is magnetised, whose field can be read."""
-        if context.of(MagneticSection) is None:
-            raise ValueError("sensors: need magnetic: nothing is magnetised, and no field applied")
-        context.needs("sensors", "the whole shell", "a mid-surface")
-        if "a thickness that does not change" in context.withdrawn:  # it follows from the area
-            context.needs("sensors", "the area as drawn")
+        refuse_unfit_reading(self.key, context)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """See that no sensor is in the undeformed shell."""
@@ -107,11 +103,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
                 raise CaseError(
                     f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns"
                 )
-            if each.field == "total" and not np.isfinite(units(context)[1]):
-                raise CaseError(
-                    f"sensors.{name}.field: total: lambda_m does not say how strong the applied field is: give "
-                    "remanent.flux_density and applied.flux_density, or field: own"
-                )
+            refuse_unknown_field(f"sensors.{name}", each.field, context)
             shell = context.shell
             if not isinstance(shell, MeshSurface) and depth(shell, np.array(each.position) / shell.reference) < 0:
                 x, y, z = each.position
@@ -119,6 +111,41 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
                     f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
                     "mid-surface: place it outside"
                 )
+
+
+def refuse_unfit_reading(key: str, context: Context) -> None:
+    """See that a field can be read where a key asks for it.
+
+    Raises
+    ------
+    ValueError
+        With the key.
+    """
+    if context.of(MagneticSection) is None:
+        raise ValueError(f"{key}: need magnetic: nothing is magnetised, and no field applied")
+    context.needs(key, "the whole shell", "a mid-surface")
+    if "a thickness that does not change" in context.withdrawn:  # it follows from the area
+        context.needs(key, "the area as drawn")
+
+
+def refuse_unknown_field(key: str, wanted: str, context: Context) -> None:
+    """See that the strength of the applied field is known, if the total one is wanted.
+
+    Raises
+    ------
+    CaseError
+        With the key.
+    """
+    if wanted == "total" and not np.isfinite(units(context)[1]):
+        raise CaseError(
+            f"{key}.field: total: lambda_m does not say how strong the applied field is: give "
+            "remanent.flux_density and applied.flux_density, or field: own"
+        )
+
+
+def is_read(context: Context) -> bool:
+    """Whether a case asks for the field at places outside the shell."""
+    return bool(context.sections.get("sensors") or context.sections.get("field_maps"))
 
 
 def depth(shell: "ShellSection | Surface", x: Array) -> float:

@@ -17,6 +17,7 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.coupled import KnowsFields
 from magshell_fenicsx.assembly.forms import FieldGradient, Share
 from magshell_fenicsx.assembly.forms import by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
@@ -38,7 +39,7 @@ from magshell_fenicsx.simulate.transfer import transfer
 
 Array = NDArray[np.float64]
 Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
-OF_CHARGES = ("remanence", "magnitude", "thickness", "deviation")  # of what acts on other parts
+OF_CHARGES = ("thickness", "deviation")  # of what acts on other parts
 MASS = "mass"
 
 
@@ -75,7 +76,11 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if slope and name in ("thickness", "deviation"):
         raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
     if scene.problem.loads.interaction and name in OF_CHARGES:
-        raise CaseError(f"{name}: beside magnetic.interaction no result has a gradient by this field")
+        raise CaseError(
+            f"{name}: beside magnetic.interaction no result has a gradient by this field; allowed are remanence, "
+            "magnitude"
+        )
+    knowing = [term for term in model.system.terms if isinstance(term, KnowsFields)]
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
 
@@ -83,6 +88,9 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         """The field, and what a place gives, whose state is set."""
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
+        w = _contracted(scene, place)
+        known = [_known(term, place, w) for term in knowing] if kind.coefficient == "Br" else []
+        f = f or next((of for of, _ in known), None)
         if f is None and slope and slope.field is not None and kind.coefficient == slope.field.name:
             f = slope.field
         if f is None or (not model.thin and kind.coefficient != "Br"):
@@ -93,8 +101,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         shares += _of_parameters(scene, place, name)
         if not number:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
-        w = _contracted(scene, place)
-        forces = [summed(shares, f, model.u, w, model.kernels)]
+        forces = [each for _, each in known] + [summed(shares, f, model.u, w, model.kernels)]
         if slope and slope.by_field is not None and slope.field is not None and not number:
             forces += [slope.by_field] if kind.coefficient == slope.field.name else []
         if name == "thickness" and scene.problem.loads.contacts:
@@ -112,6 +119,12 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     return FieldGradient(f, forces, places, normals)
+
+
+def _known(term: KnowsFields, place: Place, w: fem.Function) -> tuple[fem.Function, Array]:
+    """What a term gives that knows its derivatives by a field itself."""
+    mu = factor_of(term.amplitude, place.state.mu)
+    return term.by_field(w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu)
 
 
 def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:

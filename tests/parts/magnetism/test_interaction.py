@@ -9,6 +9,7 @@ import magpylib
 import numpy as np
 import pytest
 from command import magshell, read_path
+from dolfinx import fem
 from interrupted import start, wait_for_rows
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
@@ -20,6 +21,7 @@ from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.magnetism import interacting
+from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.gradients.gradient import gradient as gradient_of
 
@@ -390,3 +392,47 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
     slope = gradient_of(found.scene, found.latest, of="tip_uz_mm", by=key)[key]
     tips = [ran(BR + side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
     assert slope == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
+
+
+@pytest.mark.parametrize("interaction", ["others", pytest.param("all", marks=pytest.mark.slow)])
+def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: str) -> None:
+    """Of the energy and of forces along a displacement: differences of both, exact as they are quadratic; 1e-9."""
+    size = 1.5 if interaction == "others" else 3.0
+    strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, size)
+    remanent = {"kind": "expression", "components": ["1 + x/9", "y/3", "0.2"], "flux_density": f"{BR} T"}
+    magnetic = {"interaction": interaction, "remanent": remanent}
+    scene = Scene(case_of(tmp_path / "strips.msh", 0.2, magnetic=magnetic, mesh={"degree": 2}).problem())
+    term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
+    rng, u, v = np.random.default_rng(0), scene.model.u, fem.Function(scene.model.V)
+    u.x.array[:], v.x.array[:] = (size * rng.standard_normal(len(u.x.array)) for size in (1e-3, 1.0))
+    (Br, by_energy), (_, by_force) = term.by_field(v, 1.0, 0.0), term.by_field(v, 0.0, 1.0)
+    change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
+    own, forces, energies = own_field(term._sight), list[float](), list[float]()
+    own.edges = own.chargeable  # the change has charges on edges between cells
+    for side in (1, -1):
+        Br.x.array[:], b = before + side * change, np.zeros(len(u.x.array))
+        term.add_residual(b, 1.0)
+        energies.append(term.energy())
+        forces.append(float(b @ v.x.array))
+    along = change.reshape(-1, 3)[Br.function_space.dofmap.list]
+    assert np.sum(by_energy * along) == pytest.approx((energies[0] - energies[1]) / 2, rel=1e-9)
+    assert np.sum(by_force * along) == pytest.approx((forces[0] - forces[1]) / 2, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) -> None:
+    """The deflection of a tip by the remanence of both strips: differences of whole runs, 1e-5."""
+    rooted_strips(tmp_path / "strips.msh")
+
+    def ran(e: float) -> Any:
+        remanent = {"kind": "expression", "components": [f"0.5 + {e!r}*x", f"{e!r}*y", f"0.8 + {e!r}*z*x"]}
+        magnetic = {"interaction": "others", "remanent": {**remanent, "flux_density": f"{BR} T"}}
+        held, points = {"part0": "clamped", "root": "clamped"}, {"tip": ["4 mm", "1 mm", "1.5 mm"]}
+        sections = {"boundary": held, "points": points, "magnetic": magnetic, "mesh": {"degree": 2}}
+        return run(case_of(tmp_path / "strips.msh", 0.2, "20 MPa", **sections))
+
+    found, d = ran(0.0), 1e-3
+    by = gradient_of(found.scene, found.latest, of="tip_uz_mm", by="remanence")["remanence"]
+    x, y, z = np.moveaxis(by.places, -1, 0)
+    tips = [ran(side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
+    assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
