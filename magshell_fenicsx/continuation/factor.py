@@ -12,7 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import crossings, largest, solved
+from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, largest
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -66,6 +66,8 @@ class Factorisation:
         self._edged: Edged | None = None
         self.skewed = False
         self._rest: Rest | None = None
+        self._remembered: Remembered | None = None
+        self._solver: Solver | None = None  # of the present K and D, from its first solution on
         self._waiting = 0  # factorisations until the factors of a sparse part are tried again
         self.doubt = np.inf
 
@@ -80,7 +82,7 @@ class Factorisation:
         inner = tangent.K if isinstance(tangent, Edged) else tangent
         self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
-            self._edge = self._rest = None
+            self._edge = self._rest = self._solver = None
             if not (isinstance(inner, Beside) and self._factor_beside(inner)):
                 self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, Skewed):
@@ -125,15 +127,17 @@ class Factorisation:
         if self._waiting > 0:
             return False
         self._factor_symmetric(tangent.K)
+        kept = self._remembered
+        self._remembered = known = kept.of(tangent.D) if kept else Remembered(tangent.D)
         noise = np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
         counted = crossings(
-            lambda v: self._back(tangent.D.times(v)),
+            lambda v: self._back(known.times(v)),
             lambda x: dot(self.comm, x, tangent.D.times(x)),
             self._back(np.asarray(noise)),
             self.comm,
         )
         if counted is None:
-            self._waiting = PATIENT
+            self._waiting, self._remembered = PATIENT, None
             return False
         self._rest, (more, self.doubt) = tangent.D, counted
         if (changing := tangent.changing) is not None:
@@ -195,9 +199,9 @@ class Factorisation:
         """The matrix last factored times x."""
         return self._edge.times(x) if self._edge else self._product(x)
 
-    def solve(self, rhs: Vector) -> Vector:
-        """The solution with the latest factors."""
-        return self._edge.solve(rhs) if self._edge else self._inner(rhs)
+    def solve(self, rhs: Vector, *, rough: bool = False) -> Vector:
+        """The solution with the latest factors; if `rough`, within a small part of it where D stands beside K."""
+        return self._edge.solve(rhs) if self._edge else self._inner(rhs, rough=rough)
 
     def solve_transposed(self, rhs: Vector) -> Vector:
         """The same with the transposed matrix."""
@@ -223,12 +227,14 @@ class Factorisation:
         self.matrix.mult(v, y)
         return np.array(y.array_r) + (self._rest.times(x) if self._rest else 0.0)
 
-    def _inner(self, rhs: Vector) -> Vector:
+    def _inner(self, rhs: Vector, *, rough: bool = False) -> Vector:
         """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""
-        rest = self._rest
-        if rest is None:
+        if self._rest is None:
             return self._back(rhs)
-        return solved(lambda v: self._back(rest.times(v)), self._back(rhs), self.comm)
+        if self._solver is None:
+            assert self._remembered
+            self._solver = Solver(self._back, self._remembered, self.comm, len(rhs))
+        return self._solver.solve(self._back(rhs), ROUGH if rough else TOLERANCE)
 
     def _back(self, rhs: Vector) -> Vector:
         """K^-1 rhs."""
