@@ -50,6 +50,8 @@ class Factorisation:
     doubt
         Where K was factored in place of K + D, the inverse of the error of D, or of what may be of an earlier state,
         relative to it, with which the pivots' signs would still be certain; else infinite.
+    counted
+        Whether both are known of the latest tangent.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -69,10 +71,13 @@ class Factorisation:
         self._remembered: Remembered | None = None
         self._solver: Solver | None = None  # of the present K and D, from its first solution on
         self._waiting = 0  # factorisations until the factors of a sparse part are tried again
-        self.doubt = np.inf
+        self.doubt, self.counted = np.inf, True
+        self._beside: Beside | None = None
 
-    def factor(self, tangent: Tangent) -> None:
+    def factor(self, tangent: Tangent, *, counted: bool = True) -> None:
         """Factor a matrix; an edged one by the factors of its K and k back-solves.
+
+        Unless it shall be `counted`, nobody asks for the negative pivots before `count_beside`; see `knows`.
 
         Raises
         ------
@@ -83,7 +88,7 @@ class Factorisation:
         self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
             self._edge = self._rest = self._solver = None
-            if not (isinstance(inner, Beside) and self._factor_beside(inner)):
+            if not (isinstance(inner, Beside) and self._factor_beside(inner, counted or inner is not tangent)):
                 self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, Skewed):
                 self._factor_sum(inner)
@@ -115,35 +120,48 @@ class Factorisation:
         return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
 
     def _factor_symmetric(self, K: PETSc.Mat) -> None:
-        self.matrix, self.doubt = K, np.inf
+        self.matrix, self.doubt, self.counted = K, np.inf, True
         if self._rhs is None:
             self._rhs, self._solution = K.createVecs()
         if not (self._definite and self._factor_definite(K)):
             self._factor_any(K)
 
-    def _factor_beside(self, tangent: Beside) -> bool:
+    @property
+    def knows(self) -> bool:
+        """Whether D of the tangents so far was small beside K."""
+        return self._remembered is not None and self._waiting <= 1
+
+    def _factor_beside(self, tangent: Beside, counted: bool) -> bool:
         """Factor the sparse part of K + D; False if D is not small beside it."""
         self._waiting -= 1
         if self._waiting > 0:
             return False
         self._factor_symmetric(tangent.K)
         kept = self._remembered
-        self._remembered = known = kept.of(tangent.D) if kept else Remembered(tangent.D)
+        self._remembered = kept.of(tangent.D) if kept else Remembered(tangent.D)
+        self._rest, self._beside, self.counted = tangent.D, tangent, False
+        return not counted or self.count_beside()
+
+    def count_beside(self) -> bool:
+        """Count the negative pivots of K + D by the factors of K; False if D is not small beside it."""
+        if self.counted:
+            return self.doubt < np.inf
+        tangent, known = self._beside, self._remembered
+        assert tangent
+        assert known
         noise = np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
+        first = self._back(np.asarray(noise))
         counted = crossings(
-            lambda v: self._back(known.times(v)),
-            lambda x: dot(self.comm, x, tangent.D.times(x)),
-            self._back(np.asarray(noise)),
-            self.comm,
+            lambda v: self._back(known.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
         )
         if counted is None:
-            self._waiting, self._remembered = PATIENT, None
+            self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        self._rest, (more, self.doubt) = tangent.D, counted
+        more, self.doubt = counted
         if (changing := tangent.changing) is not None:
-            of_all = largest(lambda v: self._back(changing.times(v)), self._back(np.asarray(noise)), self.comm)
+            of_all = largest(lambda v: self._back(changing.times(v)), first, self.comm)
             self.doubt = max(self.doubt, of_all)
-        self.negative_pivots += more
+        self.negative_pivots, self.counted = self.negative_pivots + more, True
         return True
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:

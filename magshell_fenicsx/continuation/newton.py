@@ -111,6 +111,7 @@ class BorderedNewton:
         the solution itself.
         """
         comm, near = self.system.comm, self._tangents.state
+        exact = exact or (near is not None and not self._tangents.certain)
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not exact)
