@@ -24,6 +24,7 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
+OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
@@ -126,9 +127,9 @@ def factored_roughly(
     system: System, factors: Factorisation, state: State, stress: Sequence[Weighted] = (), *, sure: bool = True
 ) -> bool:
     """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
-    if not (isinstance(system, Roughly) and system.dear and factors.knows):
+    if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
         return False
-    if sure and factors.counted and factors.doubt > DOUBT:
+    if sure and factors.knows and factors.counted and factors.doubt > DOUBT:
         return False
     factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
     return not sure or factors.doubt <= DOUBT
@@ -290,11 +291,11 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
-        second = sum(step.own for step in steps) == 1  # which shows that the older part may be too old
-        factors = self._tangents.at(state, self._stress, rough=True, sure=second)
+        anew = sum(step.own for step in steps) == OLD
+        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False)
         matrix = Bordered(self._system, factors, state, self._name, self._row)
-        self.matrix, step = matrix, matrix.solve(*f)
-        self._chord = Chord(lambda f: matrix.solve(*f), matrix.inner, plus)
+        self.matrix, step = matrix, matrix.solve(*f, rough=True)
+        self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=True))
         return step
 
