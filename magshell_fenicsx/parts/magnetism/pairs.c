@@ -408,23 +408,34 @@ FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const doub
     return 0;
 }
 
-/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., n of M, n of L), of which in each row the first
-   `ends` (n,) are not zero, M and L (boxes, n, width). */
+/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., size): row after row (one for each number of M)
+   the first `ends` (n,), all that are not zero; M and L (boxes, n, width). Of width 1, LANES successive pairs with one G go
+   through at once. */
 FAST void translate(int64_t count, const int64_t *one, const int64_t *other, const int64_t *which, int64_t n,
-                    const int64_t *ends, int64_t width, const double *G, const double *M, double *L)
+                    const int64_t *ends, int64_t size, int64_t width, const double *G, const double *M, double *L)
 {
-    for (int64_t at = 0; at < count; ++at) {
-        const double *m = M + other[at] * n * width;
-        double *l = L + one[at] * n * width;
-        for (int64_t j = 0; j < n; ++j) {
-            const double *g = G + (which[at] * n + j) * n, x = m[j * width];
-            if (width == 1)
-                for (int64_t i = 0; i < ends[j]; ++i)
-                    l[i] += g[i] * x;
-            else
+    v m[n], l[n];
+    for (int64_t at = 0, lanes; at < count; at += lanes) {
+        const double *g = G + which[at] * size;
+        lanes = 1;
+        if (width > 1) {
+            for (int64_t j = 0; j < n; g += ends[j++])
                 for (int64_t i = 0; i < ends[j]; ++i)
                     for (int64_t k = 0; k < width; ++k)
-                        l[i * width + k] += g[i] * m[j * width + k];
+                        L[(one[at] * n + i) * width + k] += g[i] * M[(other[at] * n + j) * width + k];
+            continue;
         }
+        while (lanes < LANES && at + lanes < count && which[at + lanes] == which[at])
+            ++lanes;
+        memset(m, 0, sizeof m), memset(l, 0, sizeof l);
+        for (int64_t c = 0; c < lanes; ++c)
+            for (int64_t j = 0; j < n; ++j)
+                m[j][c] = M[other[at + c] * n + j];
+        for (int64_t j = 0; j < n; g += ends[j++])
+            for (int64_t i = 0; i < ends[j]; ++i)
+                l[i] += g[i] * m[j];
+        for (int64_t c = 0; c < lanes; ++c)
+            for (int64_t i = 0; i < n; ++i)
+                L[one[at + c] * n + i] += l[i][c];
     }
 }
