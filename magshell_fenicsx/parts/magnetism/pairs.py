@@ -25,8 +25,8 @@ FUNCTIONS = """
         double *, double *);
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
-    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t, int64_t,
-        const double *, const double *, double *);
+    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
+        int64_t, const double *, const double *, double *);
 """
 KINDS = {"float64": "double[]", "int64": "int64_t[]", "int32": "int32_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
 
