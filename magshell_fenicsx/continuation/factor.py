@@ -75,9 +75,7 @@ class Factorisation:
         self._beside: Beside | None = None
 
     def factor(self, tangent: Tangent, *, counted: bool = True) -> None:
-        """Factor a matrix; an edged one by the factors of its K and k back-solves.
-
-        Unless it shall be `counted`, nobody asks for the negative pivots before `count_beside`; see `knows`.
+        """Factor a matrix; an edged one by the factors of its K and k back-solves; `count_beside` unless `counted`.
 
         Raises
         ------
@@ -137,8 +135,7 @@ class Factorisation:
         if self._waiting > 0:
             return False
         self._factor_symmetric(tangent.K)
-        kept = self._remembered
-        self._remembered = kept.of(tangent.D) if kept else Remembered(tangent.D)
+        self._remembered = (self._remembered or Remembered(tangent.D)).of(tangent.D)
         self._rest, self._beside, self.counted = tangent.D, tangent, False
         return not counted or self.count_beside()
 
@@ -149,8 +146,7 @@ class Factorisation:
         tangent, known = self._beside, self._remembered
         assert tangent
         assert known
-        noise = np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
-        first = self._back(np.asarray(noise))
+        first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
         counted = crossings(
             lambda v: self._back(known.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
         )
@@ -249,9 +245,8 @@ class Factorisation:
         """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""
         if self._rest is None:
             return self._back(rhs)
-        if self._solver is None:
-            assert self._remembered
-            self._solver = Solver(self._back, self._remembered, self.comm, len(rhs))
+        assert self._remembered
+        self._solver = self._solver or Solver(self._back, self._remembered, self.comm, len(rhs))
         return self._solver.solve(self._back(rhs), ROUGH if rough else TOLERANCE)
 
     def _back(self, rhs: Vector) -> Vector:
