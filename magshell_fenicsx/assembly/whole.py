@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from scipy.sparse import bsr_array, csr_array
 
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.continuation.system import Beside, Vector
+from magshell_fenicsx.continuation.system import Beside, Rest, Vector
 
 Array = NDArray[np.float64]
 COLUMNS = 128  # for which products are computed at once where all entries are needed
@@ -83,6 +83,14 @@ class Rows:
     def scaled(self, factor: float) -> "Rows":
         """See `Rest`."""
         return Rows(self.matrix, [replace(part, factor=factor * part.factor) for part in self.parts])
+
+    def over(self, other: Rest) -> float:
+        """See `Rest`."""
+        if not isinstance(other, Rows) or len(other.parts) != len(self.parts):
+            return 0.0
+        pairs = list(zip(self.parts, other.parts, strict=True))
+        factors = {mine.factor / theirs.factor for mine, theirs in pairs}
+        return factors.pop() if len(factors) == 1 and all(a.acting is b.acting for a, b in pairs) else 0.0
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         """See `Rest`."""

@@ -10,15 +10,17 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
-from magshell_fenicsx.continuation.system import Vector, dot
+from magshell_fenicsx.continuation.system import Rest, Vector, dot
 
 SMALL = 0.1  # eigenvalues of A within this size are not looked at one by one
 LEAST, MOST = 4, 30  # products with A for them: as many as show that there are none beyond, and before it is given up
 RUNS = 6  # with what was found before left out: eigenvalues may be multiple
 SURE = 0.1  # error of an eigenvalue over its distance from -1
 TOLERANCE, ACCEPTED = 1e-12, 1e-7  # of a solution's rest, over the first one; the second where rounding hides more
+ROUGH = 3e-3  # the first of these of a step of Newton's method
+KEPT = 40  # products with D that are remembered
+DEPENDENT = 1e-12  # square of the part of a vector that others do not have
 Array = NDArray[np.float64]
 Map = Callable[[Vector], Vector]
 Energy = Callable[[Vector], float]
@@ -49,20 +51,85 @@ class Krylov:
         return np.asarray(sum(part * q for part, q in zip(parts, self.basis, strict=False)))
 
 
-def solved(times: Map, first: Vector, comm: MPI.Comm) -> Vector:
-    """The solution of (I + A) x = first by generalised minimal residuals; not a number if that fails."""
-    krylov, size, rest = Krylov(lambda v: v + times(v), first, comm, MOST), 0, 1.0
-    if not krylov.norm:
-        return first
-    y: Array = np.zeros(0)
-    while size < MOST and rest > TOLERANCE:
-        size = krylov.grow()
-        Q, R = np.linalg.qr(krylov.H[: size + 1, :size], mode="complete")
-        y, before = solve_triangular(R[:size], Q[0, :size]), rest
-        rest = abs(Q[0, size])
-        if before < ACCEPTED and rest > before / 2:
-            break
-    return krylov.norm * krylov.combined(y) if rest <= ACCEPTED else np.full_like(first, np.nan)
+class Remembered:
+    """D, with its first products: what they say of it serves solutions with any K."""
+
+    def __init__(self, D: Rest) -> None:
+        self.D, self.pairs = D, list[tuple[Vector, Vector]]()
+
+    def times(self, v: Vector) -> Vector:
+        """D v. Collective."""
+        product = self.D.times(v)
+        if len(self.pairs) < KEPT:
+            self.pairs.append((np.array(v), product))
+        return product
+
+    def of(self, D: Rest) -> "Remembered":
+        """This one if it is of D, or of a multiple of it, that times its factor; else a new one."""
+        factor = D.over(self.D)
+        if factor == 1.0:
+            return self
+        other = Remembered(D)
+        if factor:
+            other.pairs = [(v, factor * product) for v, product in self.pairs]
+        return other
+
+
+class Solver:
+    """Solves (I + A) x = b, A = K^-1 D, by generalised conjugate residuals that begin with all products so far.
+
+    So a solution needs few products, or none: D has few large eigenvalues over K, and earlier vectors hold their
+    directions (M. L. Parks, E. de Sturler, G. Mackey, D. D. Johnson, S. Maiti, SIAM J. Sci. Comput. 28, 2006, 1651).
+
+    Parameters
+    ----------
+    back
+        K^-1 times a vector.
+    """
+
+    def __init__(self, back: Map, of: Remembered, comm: MPI.Comm, size: int) -> None:
+        self._back, self._of, self._comm = back, of, comm
+        # u, and c = (I + A) u, orthonormal: columns, of which so many are kept
+        self._U, self._C = (np.empty((size, KEPT + MOST), order="F") for _ in range(2))
+        self._count = 0
+        if of.pairs:
+            U, products = (np.column_stack(each) for each in zip(*of.pairs, strict=True))
+            C = U + np.column_stack([back(product) for product in products.T])
+            for _ in range(2):
+                squares, Q = np.linalg.eigh(comm.allreduce(C.T @ C))
+                kept = squares > DEPENDENT * squares[-1]
+                U, C = (each @ Q[:, kept] / np.sqrt(squares[kept]) for each in (U, C))
+            self._count = C.shape[1]
+            self._U[:, : self._count], self._C[:, : self._count] = U, C
+
+    def solve(self, b: Vector, tolerance: float) -> Vector:
+        """The solution, with a rest, over b, below the tolerance; not a number if that fails."""
+        size = np.sqrt(dot(self._comm, b, b))
+        if not 0.0 < size < np.inf:
+            return b
+        x, r = self._without(np.zeros_like(b), np.array(b), -1.0)
+        rest, m = np.sqrt(dot(self._comm, r, r)) / size, self._count
+        while rest > tolerance and m < KEPT + MOST:
+            u, c = self._without(r, r + self._back(self._of.times(r)), 1.0, m)
+            norm = np.sqrt(dot(self._comm, c, c))
+            self._U[:, m], self._C[:, m] = u / norm, c / norm
+            part = dot(self._comm, self._C[:, m], r)
+            x, r, m, before = x + part * self._U[:, m], r - part * self._C[:, m], m + 1, rest
+            rest = np.sqrt(dot(self._comm, r, r)) / size
+            if before < ACCEPTED and rest > before / 2:
+                break
+        self._count = min(m, KEPT)
+        if not rest <= max(ACCEPTED, tolerance):
+            return np.full_like(b, np.nan)
+        return x + r if rest <= tolerance else x
+
+    def _without(self, u: Vector, c: Vector, sign: float, count: int | None = None) -> tuple[Vector, Vector]:
+        """What is left of c beside the columns, and u less their sum or, with the sign -1, plus it."""
+        m = self._count if count is None else count
+        for _ in range(2):  # the second time for what rounding has left
+            parts = self._comm.allreduce(self._C[:, :m].T @ c)
+            u, c = u - sign * (self._U[:, :m] @ parts), c - self._C[:, :m] @ parts
+        return u, c
 
 
 def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tuple[int, float] | None:

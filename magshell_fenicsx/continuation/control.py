@@ -162,9 +162,9 @@ class Bordered:
         per_mu = min(moved, 1 / abs(self._mu)) if self._mu else moved
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
 
-    def solve(self, f: Vector, g: float) -> Direction:
-        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
-        x1 = self._factors.solve(f)
+    def solve(self, f: Vector, g: float, *, rough: bool = False) -> Direction:
+        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g; `rough` as in `Factorisation.solve`."""
+        x1 = self._factors.solve(f, rough=rough)
         dmu = (g - slope(self._comm, self._gradient, (x1, 0.0))) / self._schur
         return x1 - dmu * self._x2, dmu
 

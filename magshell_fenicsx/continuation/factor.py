@@ -12,7 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import crossings, largest, solved
+from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, largest
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -50,6 +50,8 @@ class Factorisation:
     doubt
         Where K was factored in place of K + D, the inverse of the error of D, or of what may be of an earlier state,
         relative to it, with which the pivots' signs would still be certain; else infinite.
+    counted
+        Whether both are known of the latest tangent.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -66,11 +68,14 @@ class Factorisation:
         self._edged: Edged | None = None
         self.skewed = False
         self._rest: Rest | None = None
+        self._remembered: Remembered | None = None
+        self._solver: Solver | None = None  # of the present K and D, from its first solution on
         self._waiting = 0  # factorisations until the factors of a sparse part are tried again
-        self.doubt = np.inf
+        self.doubt, self.counted = np.inf, True
+        self._beside: Beside | None = None
 
-    def factor(self, tangent: Tangent) -> None:
-        """Factor a matrix; an edged one by the factors of its K and k back-solves.
+    def factor(self, tangent: Tangent, *, counted: bool = True) -> None:
+        """Factor a matrix; an edged one by the factors of its K and k back-solves; `count_beside` unless `counted`.
 
         Raises
         ------
@@ -80,8 +85,8 @@ class Factorisation:
         inner = tangent.K if isinstance(tangent, Edged) else tangent
         self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
-            self._edge = self._rest = None
-            if not (isinstance(inner, Beside) and self._factor_beside(inner)):
+            self._edge = self._rest = self._solver = None
+            if not (isinstance(inner, Beside) and self._factor_beside(inner, counted or inner is not tangent)):
                 self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, Skewed):
                 self._factor_sum(inner)
@@ -113,33 +118,46 @@ class Factorisation:
         return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
 
     def _factor_symmetric(self, K: PETSc.Mat) -> None:
-        self.matrix, self.doubt = K, np.inf
+        self.matrix, self.doubt, self.counted = K, np.inf, True
         if self._rhs is None:
             self._rhs, self._solution = K.createVecs()
         if not (self._definite and self._factor_definite(K)):
             self._factor_any(K)
 
-    def _factor_beside(self, tangent: Beside) -> bool:
+    @property
+    def knows(self) -> bool:
+        """Whether D of the tangents so far was small beside K."""
+        return self._remembered is not None and self._waiting <= 1
+
+    def _factor_beside(self, tangent: Beside, counted: bool) -> bool:
         """Factor the sparse part of K + D; False if D is not small beside it."""
         self._waiting -= 1
         if self._waiting > 0:
             return False
         self._factor_symmetric(tangent.K)
-        noise = np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
+        self._remembered = (self._remembered or Remembered(tangent.D)).of(tangent.D)
+        self._rest, self._beside, self.counted = tangent.D, tangent, False
+        return not counted or self.count_beside()
+
+    def count_beside(self) -> bool:
+        """Count the negative pivots of K + D by the factors of K; False if D is not small beside it."""
+        if self.counted:
+            return self.doubt < np.inf
+        tangent, known = self._beside, self._remembered
+        assert tangent
+        assert known
+        first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
         counted = crossings(
-            lambda v: self._back(tangent.D.times(v)),
-            lambda x: dot(self.comm, x, tangent.D.times(x)),
-            self._back(np.asarray(noise)),
-            self.comm,
+            lambda v: self._back(known.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
         )
         if counted is None:
-            self._waiting = PATIENT
+            self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        self._rest, (more, self.doubt) = tangent.D, counted
+        more, self.doubt = counted
         if (changing := tangent.changing) is not None:
-            of_all = largest(lambda v: self._back(changing.times(v)), self._back(np.asarray(noise)), self.comm)
+            of_all = largest(lambda v: self._back(changing.times(v)), first, self.comm)
             self.doubt = max(self.doubt, of_all)
-        self.negative_pivots += more
+        self.negative_pivots, self.counted = self.negative_pivots + more, True
         return True
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
@@ -195,9 +213,9 @@ class Factorisation:
         """The matrix last factored times x."""
         return self._edge.times(x) if self._edge else self._product(x)
 
-    def solve(self, rhs: Vector) -> Vector:
-        """The solution with the latest factors."""
-        return self._edge.solve(rhs) if self._edge else self._inner(rhs)
+    def solve(self, rhs: Vector, *, rough: bool = False) -> Vector:
+        """The solution with the latest factors; if `rough`, within a small part of it where D stands beside K."""
+        return self._edge.solve(rhs) if self._edge else self._inner(rhs, rough=rough)
 
     def solve_transposed(self, rhs: Vector) -> Vector:
         """The same with the transposed matrix."""
@@ -223,12 +241,13 @@ class Factorisation:
         self.matrix.mult(v, y)
         return np.array(y.array_r) + (self._rest.times(x) if self._rest else 0.0)
 
-    def _inner(self, rhs: Vector) -> Vector:
+    def _inner(self, rhs: Vector, *, rough: bool = False) -> Vector:
         """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""
-        rest = self._rest
-        if rest is None:
+        if self._rest is None:
             return self._back(rhs)
-        return solved(lambda v: self._back(rest.times(v)), self._back(rhs), self.comm)
+        assert self._remembered
+        self._solver = self._solver or Solver(self._back, self._remembered, self.comm, len(rhs))
+        return self._solver.solve(self._back(rhs), ROUGH if rough else TOLERANCE)
 
     def _back(self, rhs: Vector) -> Vector:
         """K^-1 rhs."""

@@ -103,33 +103,37 @@ class BorderedNewton:
         """Factor the tangent at a state, unless its factors are known."""
         return self._tangents.at(state, stress)
 
-    def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
+    def response(
+        self, state: State, name: str, row: Row, *, exact: bool = False, anew: bool = False, counted: bool = True
+    ) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
         If the latest factors belong to a state near by, they are used, and the tangent is refined with
         differences of the residual, and so is one from factors with a part of an earlier state; `exact` factors K at
-        the solution itself.
+        the solution itself, `anew` with all of its parts. Unless it shall be `counted`, the number of unstable
+        directions means nothing.
         """
         comm, near = self.system.comm, self._tangents.state
+        exact = exact or anew or (counted and near is not None and not self._tangents.certain)
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
-        matrix = self._bordered(near if fresh and near else state, name, row, rough=not exact)
+        matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
-        if not exact and ((moved and fresh) or self._tangents.rough):
+        if (moved and fresh) or self._tangents.rough:
             refined = refined_tangent(self.system, matrix, tangent, state, load, row)
             if refined is None:
-                return self.response(state, name, row, exact=True)
+                return self.response(state, name, row, anew=True)
             tangent = refined
         du, dmu = tangent
         softness = -dot(comm, load, du) / dmu - self.system.curvature(state.u, state.mu, name, name)
         return Response(du, dmu, softness, self.factorisation.negative_pivots)
 
-    def _bordered(self, state: State, name: str, row: Row, *, rough: bool) -> Bordered:
+    def _bordered(self, state: State, name: str, row: Row, *, rough: bool, sure: bool) -> Bordered:
         """The bordered matrix at a state; the one of the last solve if it has the same state and row."""
-        last, serves = self._linear.matrix, rough or not self._tangents.rough
-        if last and serves and last.row is row and last.state is state is self._tangents.state:  # the same object
-            return last
-        return Bordered(self.system, self._tangents.at(state, rough=rough), state, name, row)
+        last, count = self._linear.matrix, self.factorisation.count
+        factors = self._tangents.at(state, rough=rough, sure=sure)
+        kept = count == factors.count and last and last.row is row and last.state is state  # the same object
+        return last if kept and last else Bordered(self.system, factors, state, name, row)
 
 
 @dataclass

@@ -147,11 +147,11 @@ class Path:
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
         return self.solve(self._row(s, base), s, guess, stress)
 
-    def inside(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
+    def inside(self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True) -> Point | str:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        return self.solve(self._row(s, base), s, self.between(s, low, high), stress)
+        return self.solve(self._row(s, base), s, self.between(s, low, high), stress, counted=counted)
 
     def renewed(self, point: Point, state: State) -> Point:
         """The point at the same s with other amplitudes beside that of the path, from a state near it.
@@ -166,9 +166,14 @@ class Path:
             raise PathStopped(again, point)
         return self.as_base(again)
 
-    def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
-        """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row."""
-        point = self.recorded(lambda: self._solve(row, s, guess, stress))
+    def solve(
+        self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = (), *, counted: bool = True
+    ) -> Point | str:
+        """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
+
+        Unless it shall be `counted`, its number of unstable directions means nothing.
+        """
+        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted))
         self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
         return point
 
@@ -363,14 +368,15 @@ class Path:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
-    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted]) -> Point | str:
+    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
         before = self.newton.factorisation.count
         outcome = self.newton.solve(guess, self.name, row, stress)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
         exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-        point = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row, exact=exact))
+        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
+        point = self._point(outcome.state, s, response)
         return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:

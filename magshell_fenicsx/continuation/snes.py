@@ -24,6 +24,7 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
+OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
@@ -98,24 +99,40 @@ class Tangents:
         state, count = self._made
         return state if count == self._factorisation.count else None
 
-    def at(self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Factorisation:
-        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state."""
+    def at(
+        self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False, sure: bool = True
+    ) -> Factorisation:
+        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state.
+
+        It is not where that may change the number of unstable directions, unless that is not asked for: not `sure`.
+        """
         near, factors = self.state, self._factorisation
         other = near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm))
-        if other or (self.rough and not rough):
-            self.rough = rough and factored_roughly(self.system, factors, state, stress)
+        if other or (self.rough and not rough) or (sure and not self.certain):
+            self.rough = rough and factored_roughly(self.system, factors, state, stress, sure=sure)
             if not self.rough:
                 factors.factor(self.system.tangent(state.u, state.mu, stress))
             self._made, self._stressed = (state, factors.count), bool(stress)
         return factors
 
+    @property
+    def certain(self) -> bool:
+        """Whether the number of unstable directions is known, of the latest factors, in spite of an older part."""
+        factors = self._factorisation
+        known = factors.counted or factors.count_beside()
+        return known and (not self.rough or factors.doubt <= DOUBT)
 
-def factored_roughly(system: System, factors: Factorisation, state: State, stress: Sequence[Weighted] = ()) -> bool:
+
+def factored_roughly(
+    system: System, factors: Factorisation, state: State, stress: Sequence[Weighted] = (), *, sure: bool = True
+) -> bool:
     """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
-    if not (isinstance(system, Roughly) and system.dear and factors.doubt <= DOUBT):
+    if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
         return False
-    factors.factor(system.tangent(state.u, state.mu, stress, rough=True))
-    return factors.doubt <= DOUBT
+    if sure and factors.knows and factors.counted and factors.doubt > DOUBT:
+        return False
+    factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
+    return not sure or factors.doubt <= DOUBT
 
 
 @dataclass(frozen=True)
@@ -274,10 +291,11 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
-        factors = self._tangents.at(state, self._stress, rough=True)
+        anew = sum(step.own for step in steps) == OLD
+        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False)
         matrix = Bordered(self._system, factors, state, self._name, self._row)
-        self.matrix, step = matrix, matrix.solve(*f)
-        self._chord = Chord(lambda f: matrix.solve(*f), matrix.inner, plus)
+        self.matrix, step = matrix, matrix.solve(*f, rough=True)
+        self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=True))
         return step
 

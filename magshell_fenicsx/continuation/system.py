@@ -24,6 +24,9 @@ class Rest(Protocol):
     def scaled(self, factor: float) -> "Rest":
         """So many times this one."""
 
+    def over(self, other: "Rest") -> float:
+        """How many times another one this is; 0 if it is no multiple of it, or nobody knows."""
+
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         """The sum, with all entries; the matrix is reused by the next call. Collective."""
 

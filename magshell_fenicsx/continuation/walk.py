@@ -92,13 +92,14 @@ class _Search:
             yield from self.between(middle, high, halvings - 1)
 
     def solve(self, s: float, low: Point, high: Point) -> Point:
-        solved = self.try_at(s, low, high)
+        """A point whose number of unstable directions nobody asks for."""
+        solved = self.try_at(s, low, high, counted=False)
         if isinstance(solved, str):
             raise PathStopped(f"locating an instability: {solved}", low)
         return solved
 
-    def try_at(self, s: float, low: Point, high: Point) -> Point | str:
-        solved = self.path.inside(s, low, high, self.base)
+    def try_at(self, s: float, low: Point, high: Point, *, counted: bool = True) -> Point | str:
+        solved = self.path.inside(s, low, high, self.base, counted=counted)
         if isinstance(solved, str):
             return solved
         self.iterations += solved.iterations

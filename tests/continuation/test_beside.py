@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Beside
+from magshell_fenicsx.continuation.system import Beside, Rest
 
 Array = NDArray[np.float64]
 SIZE = 60
@@ -26,6 +26,9 @@ class Full:
 
     def scaled(self, factor: float) -> "Full":
         return Full(factor * self.D)
+
+    def over(self, other: Rest) -> float:
+        return float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         n = len(self.D)

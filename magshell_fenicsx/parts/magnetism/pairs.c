@@ -43,8 +43,8 @@ INLINE void cross(const v *a, const v *b, v *c)
     c[0] = a[1] * b[2] - a[2] * b[1], c[1] = a[2] * b[0] - a[0] * b[2], c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* T (3, k): shape functions and their derivatives; nodes (k, 3). */
-INLINE void place(int k, const double *T, const v *nodes, Point *p)
+/* T (3, k): shape functions and their derivatives; nodes (k, 3). Second derivatives are set to zero if `bent`. */
+INLINE void place(int k, const double *T, const v *nodes, int bent, Point *p)
 {
     v a[3][3];
     memset(a, 0, sizeof a);
@@ -56,7 +56,9 @@ INLINE void place(int k, const double *T, const v *nodes, Point *p)
     cross(a[1], a[2], m);
     const v square = m[0] * m[0] + m[1] * m[1] + m[2] * m[2];
     inverse_root(&square, &size);
-    memset(p, 0, sizeof *p);
+    memset(p->F, 0, sizeof p->F), memset(p->W, 0, sizeof p->W);
+    if (bent)
+        memset(p->K, 0, sizeof p->K);
     for (int i = 0; i < 3; ++i)
         p->r[i] = a[0][i], p->n[i] = m[i] * size;
     cross(a[2], p->n, p->up[0]), cross(p->n, a[1], p->up[1]);
@@ -221,14 +223,14 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
             gather(nodes + l, 3 * k, left_cell, XL + l), gather(nodes + l, 3 * k, right_cell, XR + l);
         if (same)
             for (int64_t m = 0; m < M; ++m) {
-                place(k, TR + m * 3 * k, XR, points + m);
+                place(k, TR + m * 3 * k, XR, bent, points + m);
                 gather(tR + m, M, eR + at, &points[m].t);
                 for (int64_t s = 0; s < S; ++s)
                     gather(qR + m * S + s, M * S, eR + at, QR + m * S + s);
             }
         for (int64_t p = 0; p < P; ++p) {
             Point left;
-            place(k, TL + p * 3 * k, XL, &left);
+            place(k, TL + p * 3 * k, XL, bent, &left);
             gather(tL + p, P, eL + at, &left.t);
             for (int64_t l = 0; l < L; ++l) {
                 gather(qL + p * L + l, P * L, eL + at, q + l);
@@ -242,7 +244,7 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                 v *charges = same ? QR + m * S : QR, X[24];
                 const double *T = TR + row * 3 * k, *from = hL + p * L, *to = hR + row * S;
                 if (!same) {
-                    place(k, T, XR, right);
+                    place(k, T, XR, bent, right);
                     gather(tR + row, all, eR + at, &right->t);
                     for (int64_t s = 0; s < S; ++s)
                         gather(qR + row * S + s, all * S, eR + at, charges + s);
@@ -337,7 +339,7 @@ FAST void points(int64_t count, int64_t idle, const int64_t *cells, int64_t node
         memset(G, 0, sizeof G), memset(H, 0, sizeof H);
         for (int64_t p = 0; p < P; ++p) {
             Point point;
-            place(k, T + p * 3 * k, X, &point);
+            place(k, T + p * 3 * k, X, onto != 0, &point);
             v *each = point.F;
             for (int i = 0; i < (onto ? SUMS : 6); ++i)
                 gather(sums + p * SUMS + i, P * SUMS, of, each + i);
@@ -408,23 +410,34 @@ FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const doub
     return 0;
 }
 
-/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., n of M, n of L), of which in each row the first
-   `ends` (n,) are not zero, M and L (boxes, n, width). */
+/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., size): row after row (one for each number of M)
+   the first `ends` (n,), all that are not zero; M and L (boxes, n, width). Of width 1, LANES successive pairs with one G go
+   through at once. */
 FAST void translate(int64_t count, const int64_t *one, const int64_t *other, const int64_t *which, int64_t n,
-                    const int64_t *ends, int64_t width, const double *G, const double *M, double *L)
+                    const int64_t *ends, int64_t size, int64_t width, const double *G, const double *M, double *L)
 {
-    for (int64_t at = 0; at < count; ++at) {
-        const double *m = M + other[at] * n * width;
-        double *l = L + one[at] * n * width;
-        for (int64_t j = 0; j < n; ++j) {
-            const double *g = G + (which[at] * n + j) * n, x = m[j * width];
-            if (width == 1)
-                for (int64_t i = 0; i < ends[j]; ++i)
-                    l[i] += g[i] * x;
-            else
+    v m[n], l[n];
+    for (int64_t at = 0, lanes; at < count; at += lanes) {
+        const double *g = G + which[at] * size;
+        lanes = 1;
+        if (width > 1) {
+            for (int64_t j = 0; j < n; g += ends[j++])
                 for (int64_t i = 0; i < ends[j]; ++i)
                     for (int64_t k = 0; k < width; ++k)
-                        l[i * width + k] += g[i] * m[j * width + k];
+                        L[(one[at] * n + i) * width + k] += g[i] * M[(other[at] * n + j) * width + k];
+            continue;
         }
+        while (lanes < LANES && at + lanes < count && which[at + lanes] == which[at])
+            ++lanes;
+        memset(m, 0, sizeof m), memset(l, 0, sizeof l);
+        for (int64_t c = 0; c < lanes; ++c)
+            for (int64_t j = 0; j < n; ++j)
+                m[j][c] = M[other[at + c] * n + j];
+        for (int64_t j = 0; j < n; g += ends[j++])
+            for (int64_t i = 0; i < ends[j]; ++i)
+                l[i] += g[i] * m[j];
+        for (int64_t c = 0; c < lanes; ++c)
+            for (int64_t i = 0; i < n; ++i)
+                L[one[at + c] * n + i] += l[i][c];
     }
 }

@@ -26,7 +26,7 @@ FUNCTIONS = """
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
-        const double *, const double *, double *);
+        int64_t, const double *, const double *, double *);
 """
 KINDS = {"float64": "double[]", "int64": "int64_t[]", "int32": "int32_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
 
@@ -246,18 +246,20 @@ class Pairs:
         return None if too_near else chosen
 
     def translate(self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array) -> None:
-        """Add G (.., of M, of L) number `which` times M of boxes `other` to L (boxes, .., n) of boxes `one`.
+        """Add G number `which` times M of boxes `other` to L (boxes, .., n) of boxes `one`.
 
         Parameters
         ----------
         ends
             How many of each row of G are not zero.
+        G
+            (.., sum of ends) these, of the rows of each.
         """
         p, arrays = self._pointer, [np.ascontiguousarray(each) for each in (G, M)]
         if len(one):
             numbers = [p(each) for each in (one, other, which)]
             self._lib.translate(
-                len(one), *numbers, M.shape[1], p(ends), M.shape[2], *(p(each) for each in arrays), p(L)
+                len(one), *numbers, M.shape[1], p(ends), G.shape[1], M.shape[2], *(p(each) for each in arrays), p(L)
             )
 
     def _pointer(self, array: NDArray[Any]) -> Any:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.multipoles import COUNT, translations
+from magshell_fenicsx.parts.magnetism.multipoles import COUNT, ends, translations
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -54,7 +54,7 @@ class Tree:
     Attributes
     ----------
     G
-        (offsets, COUNT, COUNT) see `multipoles.translations`, of boxes of size one.
+        (offsets, sum of `multipoles.ends`) what is not zero in `multipoles.translations`, of boxes of size one.
     near
         (own cells, cells) whether two cells act on each other directly.
     """
@@ -148,8 +148,9 @@ class Grid:
     def _translated(self, offsets: list[tuple[int, ...]]) -> Array:
         new = [each for each in offsets if each not in self._translations]
         if new:
-            self._translations.update(zip(new, translations(np.array(new, dtype=np.float64)), strict=True))
-        return np.stack([self._translations[each] for each in offsets]) if offsets else np.zeros((0, COUNT, COUNT))
+            given = np.arange(COUNT) < ends()[:, None]
+            self._translations.update(zip(new, translations(np.array(new, dtype=np.float64))[:, given], strict=True))
+        return np.stack([self._translations[each] for each in offsets]) if offsets else np.zeros((0, ends().sum()))
 
 
 def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
