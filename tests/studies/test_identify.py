@@ -1,4 +1,4 @@
-"""Parameters from measured data: what was put in is found, bands cover it; resume, ranks, and what is refused."""
+"""Parameters from measured data: what was put in is found, bands cover it; resume, and what is refused."""
 
 import itertools
 import json
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import magshell, started
+from command import magshell
 from conftest import CAP, STRIP
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
@@ -124,21 +124,6 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
     assert {each: each.stat().st_mtime_ns for each in kept} == kept
     assert again.parameters == whole.content["parameters"]
     assert again.content["evaluations"] == whole.content["evaluations"] - len(kept)
-
-
-@pytest.mark.slow
-def test_ranks(tmp_path: Path) -> None:
-    """The same on two ranks, to what sums in another order change: a coarse mesh, four data of a given noise."""
-    text = COARSE + LOOKED_FOR.partition("  candidates:")[0] + "  noise: {tip_ux: 0.05 mm, tip_uz: 0.05 mm}\n"
-    data, file, begin = synthetic(tmp_path, text), tmp_path / "strip.yaml", "shell.youngs_modulus=950 kPa"
-    data.write_text("".join(data.read_text().splitlines(keepends=True)[:3]))
-    one = ms.identify(file, data, [begin], tmp_path / "one").parameters
-    done = started("identify", file, "--data", data, "--set", begin, "--out", tmp_path / "two", ranks=2)
-    assert done.returncode == 0, done.stderr
-    two = json.loads((tmp_path / "two" / "identify.json").read_text())["parameters"]
-    for key in KEYS:
-        assert two[key]["value"] == pytest.approx(one[key]["value"], rel=1e-6)
-        assert two[key]["deviation"] == pytest.approx(one[key]["deviation"], rel=1e-5)
 
 
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
