@@ -1,4 +1,4 @@
-"""A field of remanence beside a number, and what is predicted with both; the same on 1, 2 and 3 ranks."""
+"""A field of remanence, and what is predicted with it; the same on 1, 2 and 3 ranks."""
 
 import json
 from pathlib import Path
@@ -6,23 +6,24 @@ from typing import Any
 
 import pytest
 from command import magshell, started
-from conftest import STRIP
 
-COARSE = STRIP.replace("degree: 3, refinement: 0.5", "degree: 2, refinement: 0.3").replace("points: 4", "points: 1")
-LOOKED_FOR = """
+CASE = """
+shell: {geometry: cap, radius: 40 mm, thickness: 0.8 mm, polar: 45, youngs_modulus: 1.3 MPa, poisson_ratio: 0.49}
+boundary: {rim: clamped}
+magnetic: {remanent: {flux_density: 60 mT}, applied: {flux_density: 10 mT}}
+mesh: {degree: 2, refinement: 0.3}
+loading: {kind: field, points: 1}
 identify:
-  parameters: {shell.youngs_modulus: {prior: 900 kPa, deviation: 9 kPa}}
-  remanence: {points: 3, length: 0.5, deviation: 0.05}
-  noise: {ux: 0.05 mm}
+  remanence: {points: 2, length: 0.5, deviation: 0.05}
+  noise: {w_pole: 1 um}
   narrow: remanence
-  candidates: [{of: tip_ux_mm, noise: 0.02 mm}, {of: tip_uz_mm, noise: 1 mm}]
+  candidates: [{of: w_pole_mm, noise: 100 um}, {of: energy_mJ, noise: 0.001 uJ}]
   predict:
     turned:
-      settings: [magnetic.applied.flux_density=-20 mT, magnetic.remanent.flux_density=-143 mT]
-      of: ["tip_ux_mm@end", "tip_uz_mm@end"]
+      settings: [magnetic.applied.flux_density=-10 mT, magnetic.remanent.flux_density=-60 mT]
+      of: ["w_pole_mm@end", "energy_mJ@end"]
       samples: 20
-"""
-SHAPE = "x [mm],y [mm],z [mm],ux [mm]\n8,0,0,-0.8\n"  # for 72 degrees -0.802 mm
+"""  # its meridian
 FAR = ("value", "low", "high")
 
 
@@ -32,9 +33,9 @@ def test_a_field_and_its_predictions(tmp_path: Path) -> None:
 
     On 2 and 3 ranks all is the same, but for sums in another order.
     """
-    case, data = tmp_path / "strip.yaml", tmp_path / "shape.csv"
-    case.write_text(COARSE + LOOKED_FOR)
-    data.write_text(SHAPE)
+    case, data = tmp_path / "cap.yaml", tmp_path / "measured.csv"
+    case.write_text(CASE)
+    data.write_text("applied [mT],w_pole [um]\n10,-15\n")
     words = ["identify", case, "--data", data, "--out"]
     done = magshell(*words, tmp_path / "1")
     assert done.returncode == 0, done.stderr
@@ -48,7 +49,7 @@ def test_a_field_and_its_predictions(tmp_path: Path) -> None:
         for end in ("low", "high"):
             assert by_runs[end] == pytest.approx(by_slopes[end], abs=0.15 * width)
     best = found[0]["next"]
-    assert (best["parameter"], best["result"]) == ("remanence", "tip_ux_mm")
+    assert (best["parameter"], best["result"]) == ("remanence", "energy_mJ")
     assert best["to"] < best["from"]
     for ranks in (2, 3):
         done = started(*words, tmp_path / str(ranks), ranks=ranks)
@@ -64,8 +65,8 @@ def _content(out: Path) -> dict[str, Any]:
 
 
 def _numbers(content: dict[str, Any]) -> list[float]:
-    """Values and deviations of number and field, and all that is predicted with them."""
-    modulus, field = content["parameters"]["shell.youngs_modulus"], content["remanence"]
+    """Values and deviations of the field, and all that is predicted with it."""
+    field = content["remanence"]
     several = [*content["predicted"], *content["programmes"]["turned"]["numbers"].values()]
     of_field = [v for name in ("value", "deviation") for row in field[name] for v in row]
-    return [modulus["value"], modulus["deviation"], *of_field, *(each[name] for each in several for name in FAR)]
+    return [*of_field, *(each[name] for each in several for name in FAR)]
