@@ -15,7 +15,7 @@ NOISE = 0.01
 
 def posterior() -> Fit:
     """Of a vector with two components along a line, of which eight moments were measured."""
-    J = np.array([np.kron((X < end) * (end - X), [1.0, a]) / X.size for end in (0.2, 0.5, 0.8, 1.0) for a in (0.3, -1)])
+    J = np.array([np.kron((end > X) * (end - X), [1.0, a]) / X.size for end in (0.2, 0.5, 0.8, 1.0) for a in (0.3, -1)])
     data = J @ np.kron(np.cos(2 * X), [1.0, 0.5]) + NOISE * np.random.default_rng(2).normal(size=len(J))
     smooth = Smooth(0, np.abs(X[:, None] - X), 2, 1.0, 0.3)
     start, free = np.zeros(J.shape[1]), np.full(J.shape[1], np.inf)

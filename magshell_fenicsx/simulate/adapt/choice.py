@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -29,10 +29,13 @@ class Sampled:
     ----------
     points, sizes
         (n, 2) of the chart and (n,).
+    precision
+        With which gmsh integrates them along edges: they have steps, and its 1e-9 would take 300 000 calls.
     """
 
     points: Array
     sizes: Array
+    precision: ClassVar[float] = 1e-6
 
     def __call__(self, x: Array) -> float:
         distance, near = self._tree.query(x, NEIGHBOURS)
