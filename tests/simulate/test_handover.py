@@ -244,6 +244,35 @@ def test_a_half_hands_over_to_the_whole_shell() -> None:
 
 
 @pytest.mark.slow
+def test_a_torus_that_is_closed_in_both_directions() -> None:
+    """Held at four points; its half hands an antisymmetric mode over to all of it, which finds the branch alone too."""
+    around = {"a": [1.4, 0, 0], "b": [-1.4, 0, 0], "c": [0, 1.4, 0], "d": [0, -1.4, 0]}
+    held = {"a": ["x", "y", "z"], "b": ["y", "z"], "c": ["z"], "d": ["z"]}
+    case = {
+        "shell": {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "thickness": 0.08, "poisson_ratio": 0.3},
+        "points": around,
+        "boundary": {name: {"held": axes} for name, axes in held.items()},
+        "mesh": {"degree": 3, "refinement": 0.5},
+        "loading": FOLLOWED | {"points": 2},
+    }
+    half, whole = (
+        list(follow(Scene(problem_of(case | {"symmetry": how})), remark=lambda said: None)) for how in ("auto", "none")
+    )
+    assert next(record.mode for record in half if record.label == "bifurcation") == "antisymmetric"
+    ends = [records[-1] for records in (half, whole)]
+    assert [end.scene.model.multiplicity for end in ends if end.scene] == [1, 1]
+    loads, volumes = (
+        [of(end.scene, end.point.state) for end in ends if end.scene]
+        for of in (
+            lambda scene, state: state.mu["pressure"],
+            lambda scene, state: scene.model.system.potential(state.u, state.mu, "pressure"),
+        )
+    )
+    assert loads[0] == pytest.approx(loads[1], rel=1e-6)
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-6)
+
+
+@pytest.mark.slow
 def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: Path) -> None:
     """The same path as an uninterrupted run on one rank."""
     case = tmp_path / "case.yaml"
