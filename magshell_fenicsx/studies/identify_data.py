@@ -121,7 +121,8 @@ class Names:
         shown = {q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))}
         shown |= {of: (of, of.rpartition("_")[2]) for of in SCALES} | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
-            near = next((of for of in shown if of.startswith(f"{name}_") and shown[of][0] == name), None)
+            own_names = {name} if name in self._bare or name in FOLDS else {name, f"{name}_over_h"}
+            near = next((of for of, (base, _) in shown.items() if of.startswith(f"{name}_") and base in own_names), None)
             if near and near != name:
                 raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
             own = shown.get(name, ("", ""))[1]

@@ -69,12 +69,18 @@ TORUS = {  # the outer part
     "boundary": {"bottom": "clamped", "top": "clamped"},
     "loading": FOLLOWED,
 }
+BALL = {  # more than half of a sphere
+    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.04, "polar": 120.0, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "loading": FOLLOWED,
+}
 WAVES = {  # the larger model's mesh, and w0 of h/10000 at most: it changes the load by its part of the waves' height
     "cap": (CAP | FINER, 5, FINER, "0.003*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
     "tube": (TUBE, 4, {"mesh": {"size": 0.2}}, "0.0001*sin(pi*z/2)*(x**4 - 6*x**2*y**2 + y**4)"),
     "barrel": (BARREL | FINER, 6, FINER, "0.0001*cos(6*arctan2(y, x))"),
     "torus": (TORUS | FINER, 10, FINER, "0.0001*cos(10*arctan2(y, x))"),
     "dome": (DOME | FINER, 8, FINER, "0.0001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
+    "ball": (BALL | FINER, 8, FINER, "0.00001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),  # near others
 }
 
 
