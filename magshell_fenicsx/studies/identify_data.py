@@ -121,8 +121,15 @@ class Names:
         shown = {q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))}
         shown |= {of: (of, of.rpartition("_")[2]) for of in SCALES} | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
-            own_names = {name} if name in self._bare or name in FOLDS else {name, f"{name}_over_h"}
-            near = next((of for of, (base, _) in shown.items() if of.startswith(f"{name}_") and base in own_names), None)
+            strange = name not in self._bare and name not in FOLDS
+            near = next(
+                (
+                    of
+                    for of, (base, si) in shown.items()
+                    if (base == name and of.startswith(f"{name}_")) or (strange and of == f"{name}_{si}")
+                ),
+                None,
+            )
             if near and near != name:
                 raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
             own = shown.get(name, ("", ""))[1]

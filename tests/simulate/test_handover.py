@@ -80,7 +80,7 @@ WAVES = {  # the larger model's mesh, and w0 of h/10000 at most: it changes the 
     "barrel": (BARREL | FINER, 6, FINER, "0.0001*cos(6*arctan2(y, x))"),
     "torus": (TORUS | FINER, 10, FINER, "0.0001*cos(10*arctan2(y, x))"),
     "dome": (DOME | FINER, 8, FINER, "0.0001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
-    "ball": (BALL | FINER, 8, FINER, "0.00001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),  # near others
+    "ball": (BALL | FINER, 8, FINER, "1e-5*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
 }
 
 

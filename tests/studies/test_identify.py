@@ -227,6 +227,7 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
     [
         ("applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n", [], "applied_mT = 30 is outside the path, which goes from 0"),
         ("applied [mT],tip_uz\n5,9\n", [], r"tip_uz: has no unit: write tip_uz \[mm\]"),
+        ("applied,tip_uz [mm]\n5,9\n", [], r"applied: has no unit: write applied \[mT\]"),
         ("applied [mT],tip_uz [s]\n5,9\n", [], "column tip_uz: its unit s"),
         ("applied [mT],tip_uz [mm]\n5,9\n", [], "1 data do not determine 2 parameters without a prior"),
         ("applied [mT],tip_uz [mm]\n5,9\n10,12\n", [], "2 data do not say the noise beside 2 parameters"),
