@@ -335,8 +335,8 @@ def programme(
     if columns and not place:
         raise CaseError(f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown")
     predicted = {text for each in columns for text in (each.header, each.of)}
-    if strange := next((of for of in section.changes if of not in predicted), None):
-        raise CaseError(f"{where}.changes: {strange}: is no column that is predicted; these are {', '.join(predicted)}")
+    if unknown := next((of for of in section.changes if of not in predicted), None):
+        raise CaseError(f"{where}.changes: {unknown}: is no column that is predicted; these are {', '.join(predicted)}")
     columns = [replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns]
     return Programme(name, base, section.samples, made, last, place, places, steps, columns, scalars)
 
