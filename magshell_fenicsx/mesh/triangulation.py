@@ -73,6 +73,8 @@ def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Arra
         occ.synchronize()
         for axis, low, high in shape.glued:
             _make_periodic(gmsh.model, axis, low, high)
+        if precision := getattr(size, "precision", None):
+            gmsh.option.setNumber("Mesh.LcIntegrationPrecision", precision)
         gmsh.model.mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: size(np.array([x, y])))
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(ORDER)

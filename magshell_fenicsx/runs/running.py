@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -37,6 +38,7 @@ from magshell_fenicsx.runs.modes import frequencies_after, modes_after, wanted
 from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
 from magshell_fenicsx.runs.status import RunProgress, waiting
 from magshell_fenicsx.runs.summary import Result, summary
+from magshell_fenicsx.simulate.adapt.branch import Alone, branch_error, branched
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
@@ -56,6 +58,7 @@ OF_THE_FIRST = (
     "mesh.tolerance and the estimated error are of the bifurcation in the first model, and not of what follows in the "
     "larger one"
 )
+OF_BOTH = "at the end of the branch the estimated relative error is {:.2g}, on a mesh of the larger model's own"
 ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
 
 
@@ -199,6 +202,8 @@ def _run(
         refuse_unknown(scene)
     except (CaseError, MeshError) as e:
         raise type(e)(problem.document.placed(str(e))) from None
+    if chosen and chosen.branch:
+        scene.meshed = chosen.branch.choice.applied
     result = Result(scene, scene.unloaded(), adapted=chosen)
     say(f"{', '.join(scene.problem.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     for warning in (*scene.warnings, *scene.unshown):
@@ -218,8 +223,10 @@ def _run(
         scene.journal = Stoppable(NoJournal(), watch)
         try:
             _follow(result, files, say, progress, start, watch)
-            if chosen and result.walked.handed_over:
-                result.remarks.append(OF_THE_FIRST)
+            if chosen and result.elsewhere:
+                result.branch_error = _branch_error(result)
+                known = result.branch_error is not None
+                result.remarks.append(OF_BOTH.format(result.branch_error) if known else OF_THE_FIRST)
             for step in scene.problem.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
@@ -274,9 +281,28 @@ def _mesh_for_tolerance(problem: Problem, folder: Path | None, comm: MPI.Comm, s
         except (ValueError, KeyError, TypeError, IndexError) as e:
             raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     try:
-        return adapted(problem, comm, say, doing)
+        chosen = adapted(problem, comm, say, doing)
     except NoResult as e:
         say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
+        return None
+    if not any(step.load.follows_branch or step.load.branch_points for step in problem.programme):
+        return chosen
+    try:
+        return replace(chosen, branch=branched(chosen, comm, say, doing))
+    except NoResult as e:
+        if not isinstance(e, Alone):
+            say(f"warning: mesh.tolerance is of the bifurcation alone: {e}")
+        return chosen
+
+
+def _branch_error(result: Result) -> float | None:
+    """The estimated error at the end of the branch, of a mesh that was chosen for it; collective."""
+    assert result.adapted
+    if result.adapted.branch is None or result.latest is None or result.latest.scene is result.scene:
+        return None
+    try:
+        return branch_error(result.adapted.branch, result.latest)
+    except NoResult:
         return None
 
 

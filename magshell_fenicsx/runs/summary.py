@@ -74,6 +74,8 @@ class Result:
         Sensitivities of the amplitude at the final fold, if the case requests them; see `simulate.sensitivity`.
     adapted
         The mesh and its error estimate, if the case has a tolerance.
+    branch_error
+        The estimated relative error at the end of a branch in a larger model, if that has its own mesh.
     walked
         The records that `value` is taken from.
     end
@@ -109,6 +111,7 @@ class Result:
     sensitivities: dict[str, float] = field(default_factory=dict)
     output: Stopwatch = field(default_factory=Stopwatch)
     adapted: Adapted | None = None
+    branch_error: float | None = None
     walked: History = field(default_factory=History)
     barrier: float | None = None
     end: int = 0
@@ -248,7 +251,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
-        **({"tolerance": result.adapted.account(result.value)} if result.adapted else {}),
+        **({"tolerance": result.adapted.account(result.value, result.branch_error)} if result.adapted else {}),
         "timing": {
             "jit_s": model.kernels.seconds,
             "setup_s": scene.setup_s,

@@ -131,7 +131,7 @@ def larger(scene: Scene, mode: str) -> Scene:
     why = ""
     for symmetry in asked:
         try:
-            problem = scene.problem.again({"symmetry": symmetry})
+            problem = scene.meshed(scene.problem.again({"symmetry": symmetry}))
             new = Scene(problem, scene.comm)
         except (CaseError, MeshError) as e:
             why = why or str(e)

@@ -2,6 +2,7 @@
 
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from math import copysign, nan
@@ -117,6 +118,8 @@ class Scene:
     journal, progress
         The record of the solver's results for an interrupted run, and the listener to its status. The caller that
         runs the scene sets both.
+    meshed
+        What gives a larger model, to which a mode hands over, its mesh; by default it has that of its case.
     warnings
         What is unphysical, or may be too large.
     loose
@@ -152,6 +155,7 @@ class Scene:
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
+        self.meshed: Callable[[Problem], Problem] = lambda problem: problem
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
     def retuned(self, context: Context) -> "Scene":

@@ -122,7 +122,10 @@ def identify(
         names = Names(case)
         others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
         _refuse_few(table, parameters)
-        programmes = [programme(name, source, parameters, each, made) for name, each in section.predict.items()]
+        programmes = [
+            programme(name, wider, parameters, each, made, with_field=field is not None)
+            for name, each in section.predict.items()
+        ]
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
             mark = identity(made(_without_predictions(wider))) + repr([each.key for each in parameters])

@@ -121,7 +121,15 @@ class Names:
         shown = {q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))}
         shown |= {of: (of, of.rpartition("_")[2]) for of in SCALES} | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
-            near = next((of for of in shown if of.startswith(f"{name}_") and shown[of][0] == name), None)
+            strange = name not in self._bare and name not in FOLDS
+            near = next(
+                (
+                    of
+                    for of, (base, si) in shown.items()
+                    if (base == name and of.startswith(f"{name}_")) or (strange and of == f"{name}_{si}")
+                ),
+                None,
+            )
             if near and near != name:
                 raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
             own = shown.get(name, ("", ""))[1]

@@ -79,6 +79,7 @@ class RemanenceField:
         assert prior
         shape = (len(self.start), len(self.free))
         low, high = (v[block].reshape(shape) for v in fit.band)
+        chosen = [name for name in prior.at_bounds() if np.isnan(getattr(self.smooth, name))]
         kept = np.trace(fit.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
@@ -88,7 +89,7 @@ class RemanenceField:
             "low": low.tolist(),
             "high": high.tolist(),
             "mean": self.first.reshape(shape).tolist(),
-            "prior": {"deviation": prior.deviation, "length": prior.length, "at_bounds": prior.at_bounds()},
+            "prior": {"deviation": prior.deviation, "length": prior.length, "at_bounds": chosen},
             "determined": prior.size - float(kept),
             "over": {"value": over[0], "unit": over[1]},
         }
@@ -121,6 +122,14 @@ def field_of(
     if not in_plane:
         source = Source(source.name, {**source.data, "symmetry": "none"}, source.places, source.folder, source.files)
     return RemanenceField(controls, start, free, smooth), source
+
+
+def without_room(other: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    """Why a case has no place for the field of another one, both as plain data; "" if it has."""
+    if not (other.get("magnetic") or {}).get("remanent"):
+        return f"has no magnetic.remanent, and {WHERE} is looked for"
+    there, own = ((each.get("shell") or {}).get("geometry", "hemisphere") for each in (other, data))
+    return "" if there == own else f"its geometry is {there}: the points of {WHERE} are on a {own}"
 
 
 def flux_density(case: Case) -> tuple[float, str]:

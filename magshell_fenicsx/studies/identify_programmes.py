@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -24,10 +23,12 @@ from magshell_fenicsx.problem.columns import extra_columns, sizes_in_units
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.studies.identify_data import Parameter, parameters_of
+from magshell_fenicsx.studies.identify_drawn import NORMAL, band_of, drawn
+from magshell_fenicsx.studies.identify_field import without_room
 from magshell_fenicsx.studies.identify_picture import draw_programme
 from magshell_fenicsx.studies.identify_predicted import Predictor
 from magshell_fenicsx.studies.identify_sections import IdentifySection, ProgrammeSection
-from magshell_fenicsx.studies.laplace import RIGHT, Fit
+from magshell_fenicsx.studies.laplace import Fit
 from magshell_fenicsx.studies.points import identity, value_at
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
@@ -43,8 +44,6 @@ from magshell_fenicsx.studies.runner import (
 )
 
 Array = NDArray[np.float64]
-ENOUGH = 0.9  # of the samples: a place that fewer reach has no band
-NORMAL = float(scipy.stats.norm.ppf((1 + RIGHT) / 2))
 ALWAYS = ("step", "branch", "mode", "amplitude")
 
 
@@ -229,7 +228,7 @@ class Programme:
     ) -> Iterator[dict[str, Any]]:
         values = np.array([curve.at(column, places, steps) for curve in curves])
         for i, place in enumerate(places):
-            value, band = values[0, i], _band(values[1:, i], samples)
+            value, band = values[0, i], band_of(values[1:, i], samples)
             low, high = band or (np.nan, np.nan)
             row = {
                 "step": int(steps[i]),
@@ -247,7 +246,7 @@ class Programme:
     @staticmethod
     def _number(scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int) -> dict[str, Any]:
         values = np.array([np.nan if (v := each.value(scalar)) is None else v for each in runs])
-        band = _band(values, samples)
+        band = band_of(values, samples)
         low, high = band or (None, None)
         return {"value": first.value(scalar), "low": low, "high": high, "runs": int(np.isfinite(values).sum())}
 
@@ -283,35 +282,20 @@ class _Path:
         return values
 
 
-def _band(values: Array, samples: int) -> tuple[float, float] | None:
-    """Between which 95 % of the runs lie; None if too few of them have a value."""
-    values = values[np.isfinite(values)]
-    if values.size < ENOUGH * samples:
-        return None
-    low, high = np.quantile(values, [(1 - RIGHT) / 2, (1 + RIGHT) / 2], method="hazen")
-    return float(low), float(high)
-
-
 def _file(folder: Path, key: str) -> Path:
     return folder / "points" / f"{key}.json"
 
 
-def drawn(fit: Fit, count: int) -> Array:
-    """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the bands are."""
-    size = fit.deviation
-    spread, axes = np.linalg.eigh(fit.correlation)
-    spread = np.maximum(spread, 0.0)
-    rng = np.random.default_rng(0)
-    even = [(rng.permutation(count) + 0.5) / count for _ in size]  # Latin hypercube: each axis has its quantiles
-    normal = scipy.stats.norm.ppf(np.transpose(even))
-    wider = fit.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)) / NORMAL
-    return np.asarray(fit.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
-
-
 def programme(
-    name: str, source: Source, parameters: Sequence[Parameter], section: ProgrammeSection, made: Made
+    name: str,
+    source: Source,
+    parameters: Sequence[Parameter],
+    section: ProgrammeSection,
+    made: Made,
+    *,
+    with_field: bool = False,
 ) -> Programme:
-    """What a section asks for; collective.
+    """What a section asks for; collective. Where a field is looked for, the case has room for its points.
 
     Raises
     ------
@@ -329,6 +313,8 @@ def programme(
             base.data.pop(each, None)
         if lacking := next((p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None):
             raise CaseError(f"{section.case or 'the case'} has no {lacking}, which is looked for")
+        if with_field and (strange := without_room(base.data, source.data)):
+            raise CaseError(f"{section.case or 'the case'}: {strange}")
         problem = made(base).problem()
     except CaseError as e:
         raise CaseError(f"{where}: {e}") from None
@@ -349,8 +335,8 @@ def programme(
     if columns and not place:
         raise CaseError(f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown")
     predicted = {text for each in columns for text in (each.header, each.of)}
-    if strange := next((of for of in section.changes if of not in predicted), None):
-        raise CaseError(f"{where}.changes: {strange}: is no column that is predicted; these are {', '.join(predicted)}")
+    if unknown := next((of for of in section.changes if of not in predicted), None):
+        raise CaseError(f"{where}.changes: {unknown}: is no column that is predicted; these are {', '.join(predicted)}")
     columns = [replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns]
     return Programme(name, base, section.samples, made, last, place, places, steps, columns, scalars)
 
@@ -365,7 +351,7 @@ def refuse_unfit_programmes(source: Source, case: Case, section: IdentifySection
     """
     parameters = parameters_of(source, case, section) if section.predict else ()
     for name, each in section.predict.items():
-        programme(name, source, parameters, each, made)
+        programme(name, source, parameters, each, made, with_field=section.remanence is not None)
 
 
 def _scalar(of: str, where: str) -> Scalar:

@@ -68,7 +68,8 @@ class ProgrammeSection(Section):
     """Other values in that case, as for `--set`: `["loading.3.duration=2 s"]`"""
     data: str | None = None
     """A CSV file to compare with: columns of path.csv with units. The first one is the place, such as `time [s]` or
-    `applied [mT]`; a column `step` has the number of the step, by default the last one"""
+    `applied [mT]`; a column `step` has the number of the step, by default the last one. Between the points of a run it
+    is read on straight lines"""
     of: list[str] = Field(default_factory=list)
     """Further results: a column, along the last step; or a number, as of a sweep: `time_s@tip_uz_mm=-2`, `knockdown`"""
     changes: list[str] = Field(default_factory=list)
@@ -106,7 +107,8 @@ class IdentifySection(Section):
     predict: dict[str, ProgrammeSection] = Field(default_factory=dict)
     """Name -> another history, or another case, that is predicted with the parameters found"""
     narrow: str | None = None
-    """The parameter that the next measurement should narrow; by default the one with the largest relative deviation"""
+    """What the next measurement should narrow: a parameter, by default the one with the largest relative deviation; or
+    `remanence`, the root mean square over all numbers of the field"""
     steps: int = Field(default=20, ge=1, le=1000)
     """At most so many steps of Gauss-Newton"""
 
@@ -124,6 +126,7 @@ class IdentifySection(Section):
 
     @model_validator(mode="after")
     def _narrowed_one_is_looked_for(self) -> Self:
-        if self.narrow is not None and self.narrow not in self.parameters:
-            raise ValueError(f"narrow: {self.narrow}: is none of the parameters: {', '.join(self.parameters)}")
+        allowed = [*self.parameters, *(["remanence"] if self.remanence else [])]
+        if self.narrow is not None and self.narrow not in allowed:
+            raise ValueError(f"narrow: {self.narrow}: is none of the parameters: {', '.join(allowed)}")
         return self

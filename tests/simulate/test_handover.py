@@ -20,8 +20,11 @@ from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.mesh.unfolding import Folding
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.public import problem_of
+from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
+from magshell_fenicsx.simulate.adapt.ending import at_target, near_by
 from magshell_fenicsx.simulate.follow import follow, follow_alone
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -66,12 +69,18 @@ TORUS = {  # the outer part
     "boundary": {"bottom": "clamped", "top": "clamped"},
     "loading": FOLLOWED,
 }
+BALL = {  # more than half of a sphere
+    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.04, "polar": 120.0, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "loading": FOLLOWED,
+}
 WAVES = {  # the larger model's mesh, and w0 of h/10000 at most: it changes the load by its part of the waves' height
     "cap": (CAP | FINER, 5, FINER, "0.003*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
     "tube": (TUBE, 4, {"mesh": {"size": 0.2}}, "0.0001*sin(pi*z/2)*(x**4 - 6*x**2*y**2 + y**4)"),
     "barrel": (BARREL | FINER, 6, FINER, "0.0001*cos(6*arctan2(y, x))"),
     "torus": (TORUS | FINER, 10, FINER, "0.0001*cos(10*arctan2(y, x))"),
     "dome": (DOME | FINER, 8, FINER, "0.0001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
+    "ball": (BALL | FINER, 8, FINER, "1e-5*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
 }
 
 
@@ -241,6 +250,35 @@ def test_a_half_hands_over_to_the_whole_shell() -> None:
 
 
 @pytest.mark.slow
+def test_a_torus_that_is_closed_in_both_directions() -> None:
+    """Held at four points; its half hands an antisymmetric mode over to all of it, which finds the branch alone too."""
+    around = {"a": [1.4, 0, 0], "b": [-1.4, 0, 0], "c": [0, 1.4, 0], "d": [0, -1.4, 0]}
+    held = {"a": ["x", "y", "z"], "b": ["y", "z"], "c": ["z"], "d": ["z"]}
+    case = {
+        "shell": {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "thickness": 0.08, "poisson_ratio": 0.3},
+        "points": around,
+        "boundary": {name: {"held": axes} for name, axes in held.items()},
+        "mesh": {"degree": 3, "refinement": 0.5},
+        "loading": FOLLOWED | {"points": 2},
+    }
+    half, whole = (
+        list(follow(Scene(problem_of(case | {"symmetry": how})), remark=lambda said: None)) for how in ("auto", "none")
+    )
+    assert next(record.mode for record in half if record.label == "bifurcation") == "antisymmetric"
+    ends = [records[-1] for records in (half, whole)]
+    assert [end.scene.model.multiplicity for end in ends if end.scene] == [1, 1]
+    loads, volumes = (
+        [of(end.scene, end.point.state) for end in ends if end.scene]
+        for of in (
+            lambda scene, state: state.mu["pressure"],
+            lambda scene, state: scene.model.system.potential(state.u, state.mu, "pressure"),
+        )
+    )
+    assert loads[0] == pytest.approx(loads[1], rel=1e-6)
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-6)
+
+
+@pytest.mark.slow
 def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: Path) -> None:
     """The same path as an uninterrupted run on one rank."""
     case = tmp_path / "case.yaml"
@@ -272,10 +310,7 @@ def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: P
 
 @pytest.mark.slow
 def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
-    """Gradients of the instability are of the first model, those at the end of the last; differences of runs agree.
-
-    mesh.tolerance is of the bifurcation, and the run says so.
-    """
+    """Gradients of the instability are of the first model, those at the end of the last; differences of runs agree."""
     target = "{kind: pressure, control: load, until: target, pressure: 0.505, points: 1}"
     text = (
         "shell: {geometry: cap, radius: 1, thickness: %r, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
@@ -297,9 +332,33 @@ def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
     for of in ("knockdown", "volume_change"):
         by_difference = (found[0.01001][of] - found[0.00999][of]) / 2e-5
         assert slopes[of]["numbers"]["shell.thickness"] == pytest.approx(by_difference, rel=2e-3)
-    out = tmp_path / "adapted"
-    adapted = magshell("run", case, "--set", "mesh.tolerance=0.05", "--out", out, "--no-pictures")
-    assert adapted.returncode == 0
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["tolerance"]["error_estimate"] < 0.05
-    assert any("in the first model" in said for said in summary["remarks"])
+
+
+@pytest.mark.slow
+def test_a_tolerance_holds_on_the_branch() -> None:
+    """The first mesh of the sector has 3 % of error; that of the run less than 1 %, as a mesh of degree 5 says.
+
+    The load there at the same volume lies beside by less than the estimate, and more than a quarter of it.
+    """
+    problem = problem_of({**CAP, "mesh": {"tolerance": 0.01}})
+    result = run(problem)
+    chosen, estimate = result.adapted, result.branch_error
+    assert chosen
+    assert chosen.branch
+    assert estimate
+    assert chosen.branch.rounds[0].estimate > 0.02
+    assert chosen.branch.best.estimate < 0.01
+    assert estimate < 0.01
+    assert any("at the end of the branch" in said for said in result.remarks)
+    record = result.record
+    assert record.scene
+    end = at_target(record.scene, record)
+    fine = Choice(5, 2.0).scene(record.scene.problem, record.scene.comm)
+    found = near_by(fine, record.scene, end)
+    assert found
+    assert estimate / 4 < abs(end.value / found.value - 1) < estimate
+    again = Adapted.from_json(problem, chosen.to_json())  # of a resumed run
+    assert again.branch
+    assert again.branch.best == chosen.branch.best
+    assert again.branch.choice.size
+    assert again.branch.choice.size(np.array([0.2, 0.1])) == chosen.branch.choice.size(np.array([0.2, 0.1]))  # type: ignore[misc]

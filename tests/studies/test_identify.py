@@ -1,4 +1,4 @@
-"""Parameters from measured data: what was put in is found, bands cover it; resume, ranks, and what is refused."""
+"""Parameters from measured data: what was put in is found, bands cover it; resume, and what is refused."""
 
 import itertools
 import json
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import magshell, started
+from command import magshell
 from conftest import CAP, STRIP
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
@@ -126,21 +126,6 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
     assert again.content["evaluations"] == whole.content["evaluations"] - len(kept)
 
 
-@pytest.mark.slow
-def test_ranks(tmp_path: Path) -> None:
-    """The same on two ranks, to what sums in another order change: a coarse mesh, four data of a given noise."""
-    text = COARSE + LOOKED_FOR.partition("  candidates:")[0] + "  noise: {tip_ux: 0.05 mm, tip_uz: 0.05 mm}\n"
-    data, file, begin = synthetic(tmp_path, text), tmp_path / "strip.yaml", "shell.youngs_modulus=950 kPa"
-    data.write_text("".join(data.read_text().splitlines(keepends=True)[:3]))
-    one = ms.identify(file, data, [begin], tmp_path / "one").parameters
-    done = started("identify", file, "--data", data, "--set", begin, "--out", tmp_path / "two", ranks=2)
-    assert done.returncode == 0, done.stderr
-    two = json.loads((tmp_path / "two" / "identify.json").read_text())["parameters"]
-    for key in KEYS:
-        assert two[key]["value"] == pytest.approx(one[key]["value"], rel=1e-6)
-        assert two[key]["deviation"] == pytest.approx(one[key]["deviation"], rel=1e-5)
-
-
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
     """Buckling pressures in three fields say modulus and remanence of a cap, without noise exactly."""
     text = CAP + "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
@@ -242,6 +227,7 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
     [
         ("applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n", [], "applied_mT = 30 is outside the path, which goes from 0"),
         ("applied [mT],tip_uz\n5,9\n", [], r"tip_uz: has no unit: write tip_uz \[mm\]"),
+        ("applied,tip_uz [mm]\n5,9\n", [], r"applied: has no unit: write applied \[mT\]"),
         ("applied [mT],tip_uz [s]\n5,9\n", [], "column tip_uz: its unit s"),
         ("applied [mT],tip_uz [mm]\n5,9\n", [], "1 data do not determine 2 parameters without a prior"),
         ("applied [mT],tip_uz [mm]\n5,9\n10,12\n", [], "2 data do not say the noise beside 2 parameters"),

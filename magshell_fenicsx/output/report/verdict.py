@@ -240,6 +240,9 @@ def _error(summary: Summary) -> list[Markup]:
     if best and best["error_estimate"] < estimate:
         least = number(best["error_estimate"], 2)
         said += Markup("; another mesh gives {} with {}").format(number(best["result"], 9), least)
+    on_branch = (tolerance.get("branch") or {}).get("error_estimate")
+    if on_branch is not None:
+        said += Markup(", that of the bifurcation; at the end of the branch it is {}").format(number(on_branch, 2))
     return [said + "."]
 
 

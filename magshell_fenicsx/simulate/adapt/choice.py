@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -29,10 +29,13 @@ class Sampled:
     ----------
     points, sizes
         (n, 2) of the chart and (n,).
+    precision
+        With which gmsh integrates them along edges: they have steps, and its 1e-9 would take 300 000 calls.
     """
 
     points: Array
     sizes: Array
+    precision: ClassVar[float] = 1e-6
 
     def __call__(self, x: Array) -> float:
         distance, near = self._tree.query(x, NEIGHBOURS)
@@ -125,14 +128,17 @@ class Adapted:
         The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least error.
     rounds
         All rounds in order.
+    branch
+        The same of the larger model in which the run goes on; None if it does not, or no mesh is found for it.
     """
 
     asked: Problem
     choice: Choice
     best: Round
     rounds: list[Round]
+    branch: "Adapted | None" = None
 
-    def account(self, result: float | None) -> dict[str, Any]:
+    def account(self, result: float | None, on_branch: float | None = None) -> dict[str, Any]:
         """The entry of summary.json; without an estimate if the run ended at another result than the rounds.
 
         The chosen mesh may be a cheaper one than that of the best estimate, which is there too.
@@ -141,6 +147,8 @@ class Adapted:
         ----------
         result
             Result of the run (`Ending.value`), or None.
+        on_branch
+            The estimated relative error at the end of the branch, or None.
         """
         best, least = self.best, min(self.rounds, key=lambda each: each.estimate)
         apart = max(best.estimate, LOCATED) * abs(best.result)
@@ -150,20 +158,32 @@ class Adapted:
             "error_estimate": best.estimate if same else None,
             "best": {"result": least.result, "error_estimate": least.estimate} if same else None,
             "rounds": [asdict(r) for r in self.rounds],
+            **({"branch": self.branch.of_branch(on_branch)} if self.branch else {}),
         }
+
+    def of_branch(self, estimate: float | None) -> dict[str, Any]:
+        """The part of the entry that is of the larger model."""
+        return {"error_estimate": estimate, "rounds": [asdict(r) for r in self.rounds]}
 
     def to_json(self) -> bytes:
         """All except the problem, in full precision, so that a resumed run has the same mesh on any number of ranks."""
+        return json.dumps(self._plain()).encode()
+
+    def _plain(self) -> dict[str, Any]:
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
-        rounds = [asdict(r) for r in self.rounds]
-        return json.dumps({"best": self.rounds.index(self.best), "rounds": rounds, "size": sizes}).encode()
+        own = {"best": self.rounds.index(self.best), "rounds": [asdict(r) for r in self.rounds], "size": sizes}
+        return own | ({"branch": self.branch._plain()} if self.branch else {})
 
     @classmethod
     def from_json(cls, asked: Problem, content: bytes) -> "Adapted":
         """Read the content of `to_json` for the same problem."""
-        values = json.loads(content)
+        return cls._of(asked, json.loads(content))
+
+    @classmethod
+    def _of(cls, asked: Problem, values: dict[str, Any]) -> "Adapted":
         rounds = [Round(**r) for r in values["rounds"]]
         best, size = rounds[values["best"]], values["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
-        return cls(asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds)
+        branch = cls._of(asked, values["branch"]) if values.get("branch") else None
+        return cls(asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds, branch)

@@ -5,7 +5,7 @@ shells of different shape. Here source and target have the same chart, and to a 
 exact.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import basix
@@ -241,8 +241,7 @@ class History:
             and self.last
             and self.last.amplitude not in ("", "time")
         ):
-            end = _target(scene, self.last)
-            return replace(end, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else end
+            return at_target(scene, self.last)
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
         if not self.located:
@@ -297,16 +296,20 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
     NoResult
         See `History.ending`.
     """
+    return near_by(scene, source, near) or by_path(scene)
+
+
+def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
+    """The end of a scene by Newton's method from the end on another mesh; None if it fails, or needs a path."""
     if near.kind in ("held", "instability"):
-        return by_path(scene)
+        return None
     try:
         u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
     except NotCarried:
-        return by_path(scene)
+        return None
     guess = State(u, dict(near.state.mu))
     is_fold = near.kind == "fold"
-    from_guess = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
-    return from_guess or by_path(scene)
+    return _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
 
 
 def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
@@ -328,12 +331,15 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     return Ending("target", name, _value(system, state, name, held), state, tangent, held)
 
 
-def _target(scene: Scene, record: Record) -> Ending:
-    system, state, target = scene.newton.system, record.point.state, scene.problem.programme[-1].load.target
+def at_target(scene: Scene, record: Record) -> Ending:
+    """The end of a run at a target of the record's step, or of a branch after so many points."""
+    system, state, step = scene.newton.system, record.point.state, scene.problem.programme[record.step - 1].load
+    target = step.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held = -system.potential(state.u, state.mu, name) if by_conjugate and record.amplitude not in FIELDS else None
-    return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
+    kind: Literal["target", "held"] = "held" if any(how != "load" for how in step.hold.values()) else "target"
+    return Ending(kind, name, _value(system, state, name, held), state, record.point.du, held)
 
 
 def _value(system: System, state: State, name: str, held: float | None) -> float:

@@ -200,17 +200,40 @@ def adapted(problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doin
         return adapted_solid(problem, comm, say, doing)
     doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
     choice, coarse = _first(problem, comm)
+    return rounds(problem, choice, coarse, _moved, say, doing)
+
+
+def rounds(
+    problem: Problem,
+    choice: Choice,
+    coarse: Solved,
+    moved: "Callable[[Problem, Choice, Solved], Solved]",
+    say: Say,
+    doing: Say,
+    of: str = "",
+) -> Adapted:
+    """Rounds from a coarse mesh and the end there; collective.
+
+    Parameters
+    ----------
+    moved
+        Computes the end on another mesh from one near by.
+    of
+        Of what, in the lines of the rounds.
+    """
+    tolerance = problem.mesh.tolerance
+    assert tolerance is not None
     for degree in range(CHEAP + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
-        coarse = _moved(problem, choice, coarse)
+        coarse = moved(problem, choice, coarse)
     tried: list[tuple[Round, Choice]] = []
     while True:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
-        fine = _moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
+        fine = moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
         judged = _judged(choice, coarse, fine)
         tried.append((judged, choice))
         say(
-            f"tolerance {tolerance:g}: degree {judged.degree}, {judged.cells} cells, {judged.dofs} unknowns: "
+            f"tolerance {tolerance:g}{of}: degree {judged.degree}, {judged.cells} cells, {judged.dofs} unknowns: "
             f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
         )
         least = 0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance  # what is cheap is not made worse
@@ -220,11 +243,11 @@ def adapted(problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doin
         if another is None:
             break
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")
-        choice, coarse = another, _moved(problem, another, fine)
+        choice, coarse = another, moved(problem, another, fine)
     within = [t for t in tried if t[0].estimate <= tolerance]
     best, choice = min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
     if not within:
-        say(f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}")
+        say(f"warning: no mesh was found for the tolerance{of}; the least estimated error is {best.estimate:.1e}")
     return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
@@ -253,8 +276,13 @@ def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
 
 def _judged(choice: Choice, coarse: Solved, fine: Solved) -> Round:
     (scene, low), (_, high) = coarse, fine
-    estimate = SAFETY * abs(high.value - low.value) / max(abs(high.value), np.finfo(float).tiny)
+    estimate = estimated(low.value, high.value)
     return Round(choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate)
+
+
+def estimated(low: float, high: float) -> float:
+    """The relative error of a result, from the same of one degree more."""
+    return SAFETY * abs(high - low) / max(abs(high), np.finfo(float).tiny)
 
 
 def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) -> Choice | None:

@@ -1,0 +1,98 @@
+"""A mesh for the branch on which a run goes on in another model, and the error at the branch's end.
+
+The bifurcation has the mesh of the first model. The larger model has one of its own, found in the same rounds for the
+load of the branch where it ends, at the same volume or displacement; or the displacement there at the same load.
+"""
+
+from mpi4py import MPI
+
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
+from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, at_target, near_by
+from magshell_fenicsx.simulate.adapt.tolerance import CHEAP, FIRST, Say, Solved, estimated, rounds
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import LOCATED
+
+ALONE = "the run does not go on in another model"
+
+
+class Alone(NoResult):
+    """The run does not go on in another model."""
+
+
+def branched(first: Adapted, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
+    """Find the mesh of the larger model; collective.
+
+    Parameters
+    ----------
+    first
+        The mesh of the first model.
+
+    Raises
+    ------
+    Alone
+        If the run does not go on in another model.
+    NoResult
+        If it ends there at no single load, or is lost.
+    """
+    doing("a mesh for the tolerance on the branch: the path on a coarse one")
+    choice, coarse = _first(first, comm)
+    return rounds(coarse[0].problem, choice, coarse, _moved, say, doing, of=" on the branch")
+
+
+def branch_error(chosen: Adapted, record: Record) -> float:
+    """The estimated relative error of the result at the end of a branch on the mesh chosen for it; collective.
+
+    Raises
+    ------
+    NoResult
+        If it has no single load, or is not found with one degree more.
+    """
+    scene, low = _ended(record)
+    choice = chosen.choice
+    finer = Choice(choice.degree + 1, choice.refinement, choice.size)
+    return estimated(low.value, _moved(scene.problem, finer, (scene, low))[1].value)
+
+
+def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved]:
+    """The branch on the coarsest mesh where it has a result."""
+    lost: NoResult = Alone(ALONE)
+    if first.asked.body or first.asked.given:
+        raise NoResult("of a solid, or of several shells, nothing is carried between meshes")
+    for refinement in FIRST:
+        scene, choice = first.choice.scene(first.asked, comm), Choice(CHEAP, refinement)
+        scene.meshed = choice.applied
+        last: Record | None = None
+        try:
+            for record in follow(scene, search=False, remark=lambda text: None):
+                if record.branch and record.scene is scene:
+                    break
+                if record.scene is not scene and record.label not in LOCATED:
+                    last = record
+        except Stopped as e:
+            lost = NoResult(str(e))
+            continue
+        if last is None:
+            raise Alone(ALONE)
+        return choice, _ended(last)
+    raise lost
+
+
+def _ended(record: Record) -> tuple[Scene, Ending]:
+    if record.amplitude in ("", "time"):
+        raise NoResult("a motion ends at no single load")
+    assert record.scene
+    end = at_target(record.scene, record)
+    if end.kind == "held":
+        raise NoResult("what is held besides loads needs the path")
+    return record.scene, end
+
+
+def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
+    scene = choice.scene(problem, near[0].comm)
+    end = near_by(scene, *near)
+    if end is None:
+        raise NoResult("the end of the branch is not found on another mesh")
+    return scene, end
