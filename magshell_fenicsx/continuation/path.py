@@ -25,6 +25,7 @@ SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
+TURNS = "the path turns sharply, or the step jumped to another branch"
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -350,11 +351,23 @@ class Path:
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
         chord = there.state.u - here.state.u
+        if self.newton.options.kinks:
+            return None if self._explained(here, there) else TURNS
         unexplained = chord - length / 2 * (here.du + there.du)
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
         if self._cosine(here, there) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
-            return "the path turns sharply, or the step jumped to another branch"
+            return TURNS
         return None
+
+    def _explained(self, here: Point, there: Point) -> bool:
+        """Whether a path with a corner somewhere between two points leads from one to the other."""
+        comm, length = self.system.comm, there.s - here.s
+        turn, rest = there.du - here.du, there.state.u - here.state.u - length * here.du
+        square = dot(comm, turn, turn)
+        after = dot(comm, turn, rest) / square if square else 0.0  # of the way, behind the corner
+        after = min(max(after / length, 0.0), 1.0) * length
+        gap = max_abs(comm, rest - after * turn)
+        return gap <= max(self.options.gap * max_abs(comm, rest + length * here.du), SEEN * self.system.length)
 
     def _cosine(self, a: Point, b: Point) -> float:
         """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing there."""
