@@ -258,7 +258,8 @@ class Path:
                     step = min(max(step, 1.5 * length), o.largest)
                 elif tried.factorisations >= o.hard:
                     step = 0.6 * length
-                passed, here = [*passed[1 - LOOKED_BACK :], tried], tried
+                before = [] if self._corner(here, tried) else passed[1 - LOOKED_BACK :]
+                passed, here = [*before, tried], tried
                 yield here, here.s == target
                 if not far:
                     continue
@@ -350,14 +351,20 @@ class Path:
         length = there.s - here.s
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
-        chord = there.state.u - here.state.u
         if self.newton.options.kinks:
             return None if self._explained(here, there) else TURNS
-        unexplained = chord - length / 2 * (here.du + there.du)
+        return None if self._smooth(here, there) else TURNS
+
+    def _smooth(self, here: Point, there: Point) -> bool:
+        """Whether the ends of a step lie on one smooth arc, as far as their tangents show."""
+        chord = there.state.u - here.state.u
+        unexplained = chord - (there.s - here.s) / 2 * (here.du + there.du)
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
-        if self._cosine(here, there) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
-            return TURNS
-        return None
+        return self._cosine(here, there) >= self.options.turn and gap <= max(self.options.gap * whole, SEEN)
+
+    def _corner(self, here: Point, there: Point) -> bool:
+        """Whether the path has a corner between two points, from before which nothing behind it is foreseen."""
+        return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
 
     def _explained(self, here: Point, there: Point) -> bool:
         """Whether a path with a corner somewhere between two points leads from one to the other."""

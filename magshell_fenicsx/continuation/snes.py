@@ -25,7 +25,7 @@ SMALL = 1e-3  # full Newton steps below this size shrink, unless they are roundi
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
-SEARCHED = 15  # matrices after which the steps of a line search must have shrunk
+SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
