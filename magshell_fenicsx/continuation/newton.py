@@ -85,13 +85,20 @@ class BorderedNewton:
         """The iterations of all solves so far."""
         return self._work.iterations
 
-    def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
+    def solve(
+        self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = (), *, search: bool = True
+    ) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
-        `stress` is as that of `System.tangent`, of the guess.
+        Parameters
+        ----------
+        stress
+            As that of `System.tangent`, of the guess.
+        search
+            Whether a line search is tried where full steps fail and forces set in within a step.
         """
         outcome = self._solved(self._snes, guess, name, row, stress)
-        if not outcome.converged and self._searching and outcome.reason != HIDDEN:
+        if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome

@@ -26,6 +26,7 @@ LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with w
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
+VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -118,6 +119,7 @@ class Path:
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
         self._hard = 0  # number of solves that failed or took many matrices
+        self._vain = 0  # number of solves that failed, one after the other
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
 
     def start(self, state: State, sense: float = 1.0) -> Point:
@@ -171,6 +173,7 @@ class Path:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row."""
         point = self.recorded(lambda: self._solve(row, s, guess, stress))
         self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
+        self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
@@ -351,9 +354,10 @@ class Path:
         length = there.s - here.s
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
-        if self.newton.options.kinks:
-            return None if self._explained(here, there) else TURNS
-        return None if self._smooth(here, there) else TURNS
+        corner = (
+            self.newton.options.kinks and there.negative_pivots == here.negative_pivots
+        )  # no corner is an instability
+        return None if (self._explained if corner else self._smooth)(here, there) else TURNS
 
     def _smooth(self, here: Point, there: Point) -> bool:
         """Whether the ends of a step lie on one smooth arc, as far as their tangents show."""
@@ -385,7 +389,7 @@ class Path:
 
     def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted]) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row, stress)
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
