@@ -354,9 +354,8 @@ class Path:
         length = there.s - here.s
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
-        corner = (
-            self.newton.options.kinks and there.negative_pivots == here.negative_pivots
-        )  # no corner is an instability
+        same = there.negative_pivots == here.negative_pivots
+        corner = self.newton.options.kinks and same  # no corner is an instability
         return None if (self._explained if corner else self._smooth)(here, there) else TURNS
 
     def _smooth(self, here: Point, there: Point) -> bool:
