@@ -8,12 +8,13 @@ One factorisation of K and two back-solves make a step, whatever the last row.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from magshell_fenicsx.continuation.control import Bordered, Row, plus, refined_tangent
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.snes import IN_WORDS, Linearised, NewtonOptions, Tangents, make_snes
+from magshell_fenicsx.continuation.snes import HIDDEN, IN_WORDS, Linearised, NewtonOptions, Tangents, make_snes
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
 
 
@@ -70,6 +71,8 @@ class BorderedNewton:
         self._linear = Linearised(self._tangents, self.options)
         self._x = self._linear.vector()
         self._snes = make_snes(self._linear, self._x, self.options)
+        kinks = self.options.kinks
+        self._searching = make_snes(self._linear, self._x, self.options, "bt") if kinks else None
 
     def on(self, system: System) -> "BorderedNewton":
         """A solver for another system whose tangent contains this one's; factors and counts of work are shared."""
@@ -82,13 +85,27 @@ class BorderedNewton:
         """The iterations of all solves so far."""
         return self._work.iterations
 
-    def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
+    def solve(
+        self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = (), *, search: bool = True
+    ) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
-        `stress` is as that of `System.tangent`, of the guess.
+        Parameters
+        ----------
+        stress
+            As that of `System.tangent`, of the guess.
+        search
+            Whether a line search is tried where full steps fail and forces set in within a step.
         """
-        linear, snes = self._linear, self._snes
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2])
+        outcome = self._solved(self._snes, guess, name, row, stress)
+        if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
+            again = self._solved(self._searching, guess, name, row, stress)
+            return again if again.converged else outcome
+        return outcome
+
+    def _solved(self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted]) -> Outcome:
+        linear = self._linear
+        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=snes is self._searching)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()

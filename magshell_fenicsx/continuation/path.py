@@ -25,6 +25,8 @@ SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
+TURNS = "the path turns sharply, or the step jumped to another branch"
+VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -117,6 +119,7 @@ class Path:
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
         self._hard = 0  # number of solves that failed or took many matrices
+        self._vain = 0  # number of solves that failed, one after the other
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
 
     def start(self, state: State, sense: float = 1.0) -> Point:
@@ -175,6 +178,7 @@ class Path:
         """
         point = self.recorded(lambda: self._solve(row, s, guess, stress, counted))
         self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
+        self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
@@ -262,7 +266,8 @@ class Path:
                     step = min(max(step, 1.5 * length), o.largest)
                 elif tried.factorisations >= o.hard:
                     step = 0.6 * length
-                passed, here = [*passed[1 - LOOKED_BACK :], tried], tried
+                before = [] if self._corner(here, tried) else passed[1 - LOOKED_BACK :]
+                passed, here = [*before, tried], tried
                 yield here, here.s == target
                 if not far:
                     continue
@@ -354,12 +359,30 @@ class Path:
         length = there.s - here.s
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
+        same = there.negative_pivots == here.negative_pivots
+        corner = self.newton.options.kinks and same  # no corner is an instability
+        return None if (self._explained if corner else self._smooth)(here, there) else TURNS
+
+    def _smooth(self, here: Point, there: Point) -> bool:
+        """Whether the ends of a step lie on one smooth arc, as far as their tangents show."""
         chord = there.state.u - here.state.u
-        unexplained = chord - length / 2 * (here.du + there.du)
+        unexplained = chord - (there.s - here.s) / 2 * (here.du + there.du)
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
-        if self._cosine(here, there) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
-            return "the path turns sharply, or the step jumped to another branch"
-        return None
+        return self._cosine(here, there) >= self.options.turn and gap <= max(self.options.gap * whole, SEEN)
+
+    def _corner(self, here: Point, there: Point) -> bool:
+        """Whether the path has a corner between two points, from before which nothing behind it is foreseen."""
+        return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
+
+    def _explained(self, here: Point, there: Point) -> bool:
+        """Whether a path with a corner somewhere between two points leads from one to the other."""
+        comm, length = self.system.comm, there.s - here.s
+        turn, rest = there.du - here.du, there.state.u - here.state.u - length * here.du
+        square = dot(comm, turn, turn)
+        after = dot(comm, turn, rest) / square if square else 0.0  # of the way, behind the corner
+        after = min(max(after / length, 0.0), 1.0) * length
+        gap = max_abs(comm, rest - after * turn)
+        return gap <= max(self.options.gap * max_abs(comm, rest + length * here.du), SEEN * self.system.length)
 
     def _cosine(self, a: Point, b: Point) -> float:
         """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing there."""
@@ -370,7 +393,7 @@ class Path:
 
     def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row, stress)
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before

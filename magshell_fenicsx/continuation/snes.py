@@ -26,6 +26,7 @@ GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
+SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
@@ -72,6 +73,8 @@ class NewtonOptions:
         An iteration that moves u by more than this many lengths counts as divergence.
     patience
         Matrices after which the steps of a solve must have shrunk.
+    kinks
+        Whether forces set in within a step, as where shells touch: full steps then circle, and a path has corners.
     """
 
     tolerance: float = 1e-9
@@ -82,6 +85,7 @@ class NewtonOptions:
     fresh: float = 0.05
     largest_step: float = 1e4
     patience: int = 4
+    kinks: bool = False
 
 
 class Tangents:
@@ -161,10 +165,13 @@ class Iterates:
         A longer step counts as divergence.
     patience
         Matrices after which steps must have shrunk.
+    searched
+        Whether a line search shortens them: then they may grow.
     """
 
     largest: float = np.inf
     patience: int = 4
+    searched: bool = False
     steps: list[Step] = field(default_factory=list)
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
@@ -186,7 +193,7 @@ class Iterates:
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
-        if step.own and len(before) > 2 and step.size > 2 * full[-1]:
+        if step.own and len(before) > 2 and step.size > 2 * full[-1] and not self.searched:
             return "diverged"
         if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
@@ -208,11 +215,14 @@ class Linearised:
         self._state: State | None = None
         self._ahead: Direction | None = None
 
-    def begin(self, guess: State, name: str, row: Row, stress: Sequence[Weighted], tolerance: float) -> None:
-        """Begin a solve; as `BorderedNewton.solve`."""
+    def begin(
+        self, guess: State, name: str, row: Row, stress: Sequence[Weighted], tolerance: float, *, searched: bool = False
+    ) -> None:
+        """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
         self._tolerance = tolerance
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
-        self._iterates = Iterates(self._options.largest_step, self._options.patience)
+        patience = SEARCHED if searched else self._options.patience
+        self._iterates = Iterates(self._options.largest_step, patience, searched)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 
@@ -337,8 +347,8 @@ class Linearised:
         return self._guess.with_(u, self._name, mu)
 
 
-def make_snes(linearised: Linearised, x: PETSc.Vec, options: NewtonOptions) -> PETSc.SNES:
-    """A SNES for vectors like `x`, with full steps unless PETSc's options set a line search."""
+def make_snes(linearised: Linearised, x: PETSc.Vec, options: NewtonOptions, search: str = "basic") -> PETSc.SNES:
+    """A SNES for vectors like `x`, with a line search, full steps if `basic`; PETSc's options may set another."""
     sizes = x.getSizes()
     J = PETSc.Mat().createPython((sizes, sizes), context=linearised, comm=x.comm)
     J.setUp()
@@ -350,13 +360,13 @@ def make_snes(linearised: Linearised, x: PETSc.Vec, options: NewtonOptions) -> P
     snes.setTolerances(stol=options.tolerance, max_it=options.max_iterations)
     snes.getKSP().setType("preonly")
     given = PETSc.Options(PREFIX)
-    full_steps = not given.hasName("snes_linesearch_type")
-    if full_steps:  # not PETSc's default; if they fail, the path takes a smaller step
-        given["snes_linesearch_type"] = "basic"
+    ours = not given.hasName("snes_linesearch_type")
+    if ours:  # full steps are not PETSc's default; if they fail, the path takes a smaller step
+        given["snes_linesearch_type"] = search
     for prefix in (PREFIX, ""):
         snes.setOptionsPrefix(prefix)
         snes.setFromOptions()
-    if full_steps:
+    if ours:
         given.delValue("snes_linesearch_type")
     pc = snes.getKSP().getPC()
     pc.setType("python")

@@ -151,7 +151,8 @@ class Scene:
             raise MeshError(motion)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
-        options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts or self.model.touchings else None
+        touches = bool(self.model.touchings)
+        options = NewtonOptions(fresh=0.0, patience=7, kinks=touches) if self.model.contacts or touches else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()

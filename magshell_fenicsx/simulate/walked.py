@@ -60,12 +60,17 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     """A walk on which bodies become stiffer and shells are cut anew; magnets on the way and returning bodies end it."""
 
+    cut = list[float]()  # where the cuts were made anew: once before each point
+
     def checked(low: Point, high: Point) -> State | None:
         refuse_crossing(stage, low, high)
         refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
-        return stiffer(stage, low, high) or recut(stage, low, high)
+        if (raised := stiffer(stage, low, high)) or low.s in cut:  # points that have slid are no worse than uncut ones
+            return raised
+        cut[:] = [low.s]
+        return recut(stage, low, high)
 
     walk = Walk(path, start, goal, checked)  # which `checked` looks at
     return walk

@@ -23,5 +23,5 @@ def test_nothing_passes_through(tmp_path: Path) -> None:
     pushed = push(tmp_path, 2)
     assert not pushed.stopped
     assert pushed.factor == 1
-    assert pushed.touching > 2
+    assert pushed.touching >= 2  # of 16 points: steps in contact are long
     assert pushed.crossings == 0

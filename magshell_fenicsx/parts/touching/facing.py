@@ -14,6 +14,7 @@ from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BULGE,
+    LATTICES,
     SIGNS,
     WAYS,
     Cells,
@@ -28,8 +29,8 @@ from magshell_fenicsx.parts.touching.segments import Points
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
 MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
-BETWEEN = 0.4  # of a cell's radius: no place of it is farther from all those between which the search begins
-MANY = 100_000  # pairs of a point and a cell at a time
+BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
+MANY = 2_000_000  # distances of a point from a place at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
@@ -137,18 +138,19 @@ class Facing:
         point, cell = point[close], cell[close]
         if not len(point):
             return nowhere()
-        X, shape = cells.lattice
-        used, which = np.unique(cell, return_inverse=True)
-        spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
-        start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
-        for some in np.array_split(np.arange(len(cell)), 1 + len(cell) // MANY):
-            away = np.linalg.norm(spread[which[some]] - x[point[some], None, :3], axis=2)
-            start[some] = away.argmin(axis=1)
-            least[some] = away[np.arange(len(some)), start[some]]
-        close = least < reach + BETWEEN * radii[cell]
-        point, cell, start = point[close], cell[close], start[close]
-        if not len(point):
-            return nowhere()
+        for parts, (X, shape) in zip(LATTICES, cells.lattices, strict=True):
+            used, which = np.unique(cell, return_inverse=True)
+            spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
+            start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
+            for some in np.array_split(np.arange(len(cell)), 1 + len(cell) * len(X) // MANY):
+                off = spread[which[some]] - x[point[some], None, :3]
+                away = np.einsum("nmi,nmi->nm", off, off)
+                start[some] = away.argmin(axis=1)
+                least[some] = np.sqrt(away[np.arange(len(some)), start[some]])
+            close = least < reach + BETWEEN / parts * radii[cell]
+            point, cell, start = point[close], cell[close], start[close]
+            if not len(point):
+                return nowhere()
         at = Places(point, cell, *project(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
         return at.of(at.distance < of_faces)
 

@@ -24,7 +24,10 @@ BESIDE = (
     4.8  # thicknesses of the way along sides of cells to what a point cannot touch: that is at most 1.2 times as long
 )
 BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
-LATTICE = 4  # parts of a side of a cell, between which the search for the nearest place begins
+LATTICES = (
+    4,
+    12,
+)  # parts of the sides of cells, between which the search for the nearest place begins: coarse, then fine
 STRIP = 500  # vertices from which ways are searched together
 ROUNDS = 30  # Newton's steps at most
 EXACT = 1e-10  # after a smaller step, in the reference cell, the place is exact: steps converge quadratically
@@ -71,11 +74,10 @@ class Cells:
         return np.asarray(beyond.reshape(-1, 3))
 
     @cached_property
-    def lattice(self) -> tuple[Array, Array]:
-        """Places (m, 2) spread over the reference cell, and the shape functions there."""
-        n = LATTICE
-        X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
-        return X, self.element.tabulate(0, X)[0, :, :, 0]
+    def lattices(self) -> list[tuple[Array, Array]]:
+        """Places (m, 2) spread over the reference cell, and the shape functions there; coarse ones and fine ones."""
+        spread = [np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n for n in LATTICES]
+        return [(X, self.element.tabulate(0, X)[0, :, :, 0]) for X in spread]
 
     def near_in_surface(self, r0: Array, far: float) -> Longs:
         """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than `far`.
