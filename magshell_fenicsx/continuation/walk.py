@@ -59,7 +59,7 @@ def instabilities(path: Path, low: Point, high: Point, tolerance: float = LOCATE
 
 @dataclass
 class _Search:
-    """A search between two points, the first of which is the base of solves; counts are since the last located point."""
+    """A search between two points, the first of which is the base of solves; counts are since the last result."""
 
     path: Path
     base: Point
