@@ -37,7 +37,7 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert float(one[-1]["contact_force"]) > 0
     for other in others:
         own, others_own = ([row["label"] for row in rows if row["label"] != "step"] for rows in (one, other))
-        assert own == others_own  # steps before a touch depend on rounding, which messages of three ranks make by chance
+        assert own == others_own  # steps before a touch depend on rounding, of three ranks by chance
         for column in EXACT:
             a, b = (np.array([float(row[column]) for row in rows if row["label"] == "target"]) for rows in (one, other))
             largest = np.nanmax(np.abs([float(row[column]) for row in one]))
