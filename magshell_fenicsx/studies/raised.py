@@ -73,7 +73,7 @@ def raise_lowest(
     """
     low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-    span = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
+    span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
 
     def place(y: Array) -> _Place | None:
         evaluation = evaluated(span * y)
