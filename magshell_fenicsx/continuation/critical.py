@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import copysign
 
-from magshell_fenicsx.continuation.augmented import Locus
+from magshell_fenicsx.continuation.augmented import Locus, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.system import Vector
 
-ASIDE, SHORTER = 0.01, 5  # of the range: how far from a crossing the other mode is taken up; and how often half of that
+ASIDE = 0.01  # of the range: how far beyond a crossing the other mode is taken up
+HALVINGS = 5  # of that distance, until the mode is found there
 
 
 def critical(
@@ -35,8 +36,8 @@ def critical(
 
     Raises
     ------
-    BoundaryLost
-        See `Boundary.followed`.
+    BoundaryLost, NoSystem
+        See `Boundary.followed`; there is no system where another mode is taken up.
     """
     begun_by: int | None = None  # the family of the boundary before, where this one begins at their crossing
     while True:
@@ -65,9 +66,9 @@ def _beyond(mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tu
     """A point of a boundary near its crossing, at which its equations are singular."""
     room = (ends[1] if sense > 0 else ends[0]) - crossing.p
     off = copysign(min(ASIDE * mode.scales[1], abs(room) / 2), sense)
-    for _ in range(SHORTER):
+    for _ in range(HALVINGS):
         try:
             return mode.start(crossing.p + off, crossing.state, phi)
-        except BoundaryLost:
+        except (BoundaryLost, NoSystem):
             off /= 2
     return mode.start(crossing.p + off, crossing.state, phi)

@@ -143,12 +143,12 @@ class Factorisation:
         """Count the negative pivots of K + D by the factors of K; False if D is not small beside it."""
         if self.counted:
             return self.doubt < np.inf
-        tangent, known = self._beside, self._remembered
-        assert tangent
-        assert known
+        tangent, remembered = self._beside, self._remembered
+        if not tangent or not remembered:  # an earlier count failed
+            return False
         first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
         counted = crossings(
-            lambda v: self._back(known.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
+            lambda v: self._back(remembered.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
         )
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None

@@ -15,7 +15,7 @@ def slope(places: Sequence[float]) -> list[tuple[float, float]]:
 
 
 def interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
-    """The polynomial through some points."""
+    """The value at `at` of the polynomial through the points (x, y)."""
     return float(barycentric_interpolate(x, y, at))
 
 

@@ -125,15 +125,21 @@ class BorderedNewton:
     ) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
-        If the latest factors belong to a state near by, they are used, and the tangent is refined with
-        differences of the residual, and so is one from factors with a part of an earlier state; `exact` factors K at
-        the solution itself, `anew` with all of its parts. Unless it shall be `counted`, the number of unstable
-        directions means nothing.
+        Factors of a state near by are used if they serve; the tangent is then refined by differences of the residual.
+
+        Parameters
+        ----------
+        exact
+            Whether K is factored at the solution itself; a small part of it may be older.
+        anew
+            Whether no part may be older.
+        counted
+            If not, the number of negative pivots means nothing.
         """
         comm, near = self.system.comm, self._tangents.state
-        exact = exact or anew or (counted and near is not None and not self._tangents.certain)
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
-        fresh = moved <= self.options.fresh and not exact
+        serves = moved <= self.options.fresh and not (exact or anew)
+        fresh = serves and (not counted or self._tangents.certain)
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         if (moved and fresh) or self._tangents.rough:

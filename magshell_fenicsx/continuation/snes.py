@@ -108,7 +108,7 @@ class Tangents:
     ) -> Factorisation:
         """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state.
 
-        It is not where that may change the number of unstable directions, unless that is not asked for: not `sure`.
+        If also `sure`, it is so only where that cannot change the number of unstable directions.
         """
         near, factors = self.state, self._factorisation
         other = near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm))

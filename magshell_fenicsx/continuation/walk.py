@@ -9,6 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.control import projected
+from magshell_fenicsx.continuation.interpolated import stationary
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
@@ -218,8 +219,8 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue says that more is left, it goes
-        on as long as that shrinks. The order of the method is 1.44, and close to zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue shows a larger error, it goes on
+        until that is no longer halved. The method's order is 1.44, and close to zero the eigenvalue is only rounding.
         """
         name, side, last, best = self.path.name, 0, np.inf, None
         first = critical_mode(stability, low.state)
@@ -240,7 +241,7 @@ class _Search:
                 if stalled or found.load_error <= self.tolerance * abs(mu):
                     return min(best or found, found, key=lambda one: one.load_error)
                 best = found  # the next guess, from the other side, may be nearer
-            if width <= self.tolerance * abs(mu):
+            if width <= self.tolerance * abs(mu) and not best:
                 return replace(point, load_error=max(width, self.rest(point, stability, _slope_of(*ends), width)))
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
@@ -253,7 +254,7 @@ class _Search:
                 ends = (mu, a), ends[1]
                 b = b / 2 if side == -1 else b
                 side = -1
-        return replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
+        return best or replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
 
 
 def _slope_of(low: tuple[float, float], high: tuple[float, float]) -> float:
@@ -265,12 +266,7 @@ def _slope_of(low: tuple[float, float], high: tuple[float, float]) -> float:
 def _stationary(low: Point, high: Point, name: str) -> float:
     """Where the Hermite cubic of mu(s) is stationary between the ends."""
     L = high.s - low.s
-    rise = (high.state.mu[name] - low.state.mu[name]) / L
-    c1, c2, c3 = low.dmu, 3 * rise - 2 * low.dmu - high.dmu, low.dmu + high.dmu - 2 * rise
-    roots = np.roots([3 * c3, 2 * c2, c1])
-    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
-    t = inside[0] if inside else low.dmu / (low.dmu - high.dmu)
-    return low.s + L * min(max(t, 1e-3), 1 - 1e-3)
+    return low.s + L * stationary((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
 
 
 def locate_bifurcation(

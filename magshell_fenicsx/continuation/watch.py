@@ -178,9 +178,9 @@ class Watch:
     faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
     get a look.
 
-    Modes of several families may soften and recover between two points. The tangents along a step are bounded by those
-    at its ends and a third one (coefficients of Bernstein of the parabola through the last three looks). Where this is
-    not positive definite, though the ends are, the point half way gets a look, and both halves are looked at alike.
+    Between two points several families may soften and recover. The tangents of the parabola through the last three
+    looks are means of three matrices (its Bernstein coefficients): those at both ends and one between. If that one is
+    not positive definite for a family that is stable at both ends, the point half way gets a look, and so on.
 
     Parameters
     ----------

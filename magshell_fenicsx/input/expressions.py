@@ -116,13 +116,14 @@ _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
 _ALLOWED = (*(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant), *_OPERATORS)
 _Step = tuple[Callable[..., Any], int] | np.float64 | str  # of a stack: a function of some values, a number, a name
 _Operation = tuple[Callable[..., Any], tuple[int, ...], tuple[int, ...]]  # of which values, and which are then not used
+_Program = list[_Operation | np.float64 | str]
 
 
 @dataclass(frozen=True)
 class Read:
     """A formula as a function of x, y, z (in lengths of R)."""
 
-    steps: "list[_Operation | np.float64 | str]"
+    steps: _Program
 
     def __call__(self, x: Array, y: Array, z: Array) -> Array:
         return np.broadcast_to(np.asarray(_evaluate(self.steps, x, y, z), dtype=np.float64), x.shape)
@@ -215,7 +216,7 @@ def with_derivatives(text: str) -> Callable[[Array], Taylor]:
     return evaluate
 
 
-def _read(text: str) -> list[_Operation | np.float64 | str]:
+def _read(text: str) -> _Program:
     said = text if len(text) <= 60 else f"{text[:57]}..."
     try:
         tree = ast.parse(text, mode="eval")
@@ -241,30 +242,26 @@ def _read(text: str) -> list[_Operation | np.float64 | str]:
     return _once(_steps(tree))
 
 
-def _once(steps: list[_Step]) -> list[_Operation | np.float64 | str]:
+def _once(steps: list[_Step]) -> _Program:
     """The steps with what is written several times computed once, as the weights of points are."""
-    numbers, stack = dict[Any, int](), list[int]()  # of each function of values, number or name
+    numbers, stack, operands = dict[Any, int](), list[int](), list[tuple[int, ...]]()
+    made = list[Any]()
     for step in steps:
-        key: Any = step
-        if isinstance(step, tuple):
-            function, count = step
-            key, stack[-count:] = (function, tuple(stack[-count:])), []
-        elif not isinstance(step, str):
-            key = (step.hex(),)  # 0.0 and -0.0 are not the same
-        stack.append(numbers.setdefault(key, len(numbers)))
-    last = {value: i for i, key in enumerate(numbers) if isinstance(key, tuple) and len(key) == 2 for value in key[1]}
-    made = list[_Operation | np.float64 | str]()
-    for i, key in enumerate(numbers):
-        if isinstance(key, str):
-            made.append(key)
-        elif len(key) == 1:
-            made.append(np.float64(float.fromhex(key[0])))
-        else:
-            made.append((*key, tuple(value for value in dict.fromkeys(key[1]) if last[value] == i)))
-    return made
+        of = tuple(stack[-step[1] :]) if isinstance(step, tuple) else ()
+        stack = stack[: len(stack) - len(of)]
+        key = (step[0], of) if isinstance(step, tuple) else step if isinstance(step, str) else step.hex()
+        if key not in numbers:  # 0.0 and -0.0 are not the same
+            numbers[key] = len(made)
+            made.append(step)
+            operands.append(of)
+        stack.append(numbers[key])
+    last = {value: i for i, of in enumerate(operands) for value in of}
+    no_more = [tuple(value for value in dict.fromkeys(of) if last[value] == i) for i, of in enumerate(operands)]
+    each = zip(made, operands, no_more, strict=True)
+    return [(step[0], of, then) if isinstance(step, tuple) else step for step, of, then in each]
 
 
-def _evaluate(steps: "list[_Operation | np.float64 | str]", x: Any, y: Any, z: Any) -> Any:
+def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
     names, values = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
     with np.errstate(all="ignore"):
         for step in steps:

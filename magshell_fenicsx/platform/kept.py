@@ -139,7 +139,8 @@ def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
         lost = [source for source in ready if source not in forms and not (folder / source).exists()]
         strange |= {source.split(".")[0] for source in lost}  # FFCx would fail
         marks = {name: file for name, file in kept.items() if alone and name not in forms}
-        strange |= _unfinished(forms, marks) if alone else set()
+        with suppress(OSError):  # another program may remove one meanwhile
+            strange |= _unfinished(forms, marks) if alone else set()
         _remove(folder, [name for name in forms if name.split(".")[0] in strange] + [*marks])
     for other in also:
         for file in other.glob(f"{FORMS}*") if other != folder else ():

@@ -38,7 +38,7 @@ from magshell_fenicsx.runs.modes import frequencies_after, modes_after, wanted
 from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
 from magshell_fenicsx.runs.status import RunProgress, waiting
 from magshell_fenicsx.runs.summary import Result, summary
-from magshell_fenicsx.simulate.adapt.branch import Alone, branch_error, branched
+from magshell_fenicsx.simulate.adapt.branch import branch_error, branched
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
@@ -290,8 +290,7 @@ def _mesh_for_tolerance(problem: Problem, folder: Path | None, comm: MPI.Comm, s
     try:
         return replace(chosen, branch=branched(chosen, comm, say, doing))
     except NoResult as e:
-        if not isinstance(e, Alone):
-            say(f"warning: mesh.tolerance is of the bifurcation alone: {e}")
+        say(f"warning: mesh.tolerance is of the bifurcation alone: {e}")
         return chosen
 
 

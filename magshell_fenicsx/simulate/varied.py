@@ -201,8 +201,10 @@ class Varied:
 
     def kind_of(self, m: int, at: Locus | None = None) -> Kind:
         """What a boundary of m waves is, or of the model's own mode (m = 0) near a point."""
-        if m or (at is None or not self.m):
-            return "bifurcation" if m else self.kind
+        if m:
+            return "bifurcation"
+        if at is None:
+            return self.kind
         system, phi = self.at(at.p).system, self.mode_at(at, 0, self.m)
         load = system.load(at.state.u, at.state.mu, self.name)
         return "fold" if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi) else "bifurcation"

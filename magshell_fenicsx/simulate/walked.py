@@ -60,16 +60,17 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     """A walk on which bodies become stiffer and shells are cut anew; magnets on the way and returning bodies end it."""
 
-    cut = list[float]()  # where the cuts were made anew: once before each point
+    cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
 
     def checked(low: Point, high: Point) -> State | None:
+        nonlocal cut_at
         refuse_crossing(stage, low, high)
         refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
-        if (raised := stiffer(stage, low, high)) or low.s in cut:  # points that have slid are no worse than uncut ones
+        if (raised := stiffer(stage, low, high)) or low.s == cut_at:  # slid points are better than none
             return raised
-        cut[:] = [low.s]
+        cut_at = low.s
         return recut(stage, low, high)
 
     walk = Walk(path, start, goal, checked)  # which `checked` looks at

@@ -332,7 +332,7 @@ def _followed(
         rows.append(_row(varied, "start", start, mode))
         for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
             take(label, locus, on)
-    except BoundaryLost as e:
+    except (BoundaryLost, NoSystem) as e:
         if not rows:
             raise Stopped(str(e)) from None
         return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": varied.alone}
@@ -341,7 +341,9 @@ def _followed(
 
 def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary) -> dict[str, Any]:
     families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
-    own = varied.kind_of(0, locus) if len(families) > 1 else "" if varied.m else varied.mode
+    own = "" if varied.m else varied.mode
+    if len(families) > 1 and not families[0]:
+        own = varied.kind_of(0, locus)
     return {
         "key": float(locus.p),
         **_load(varied.name, locus.state.mu[varied.name], varied.problem(locus.p)),

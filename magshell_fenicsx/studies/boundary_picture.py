@@ -169,7 +169,7 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
         return whole
     extent, named = np.ptp([row["key"] for row in rows]), [each for each in whole if each[2] == "stable"]
     for mode, part in parts:
-        kind = next(row["kind"] for row in part if row["kind"] in ("fold", "bifurcation"))
+        kind = next((row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"])
         for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
             width = np.ptp([row["key"] for row in part]) / extent
             outer = limits[1] if y > 0 else limits[0]

@@ -48,7 +48,7 @@ class _Place:
     @property
     def height(self) -> float:
         """The lowest value, less what broken constraints count."""
-        return float(self.values.min() - BROKEN * max(0.0, *(-self.kept), 0.0))
+        return float(self.values.min() + BROKEN * self.kept.min(initial=0.0))
 
 
 def raise_lowest(
@@ -75,15 +75,16 @@ def raise_lowest(
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
 
-    def place(y: Array) -> _Place | None:
-        evaluation = evaluated(span * y)
+    def place(x: Array) -> _Place | None:
+        evaluation = evaluated(x)
         if not evaluation.values:
             return None
         kept = goal.constraints(evaluation)
-        kept_slopes = span * goal.constraint_slopes(evaluation) if len(kept) else np.zeros((0, len(y)))
-        return _Place(y, goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation), kept, kept_slopes)
+        kept_slopes = span * goal.constraint_slopes(evaluation) if len(kept) else np.zeros((0, len(x)))
+        values, slopes = goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation)
+        return _Place(x / span, values, slopes, kept, kept_slopes)
 
-    best, size = place(first / span), FIRST
+    best, size = place(first), FIRST
     assert best
     others: list[_Place] = []
     for _ in range(iterations):
@@ -91,7 +92,7 @@ def raise_lowest(
         step, gain = _foreseen(best, others[-REMEMBERED:], box)
         if gain < ENOUGH:
             return f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained"
-        tried = place(np.clip(best.y + step, low / span, high / span))
+        tried = place(np.clip(span * (best.y + step), low, high))
         part = (tried.height - best.height) / gain if tried else -np.inf
         if part > TAKEN:
             assert tried
@@ -115,10 +116,10 @@ def _foreseen(best: _Place, others: Sequence[_Place], box: tuple[Array, Array]) 
     n, of_values, of_kept = len(best.y), sum(map(len, planes)), len(best.kept)
     under = np.column_stack([-np.vstack(slopes), np.ones(of_values), np.zeros(of_values)])
     within = np.column_stack([-best.kept_slopes, np.zeros(of_kept), -np.ones(of_kept)])
-    found = scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
+    program = scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
         np.concatenate([np.zeros(n), [-1.0, BROKEN]]),
         A_ub=np.vstack([under, within]),
         b_ub=np.concatenate([*planes, best.kept]),
         bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
     )
-    return found.x[:n], float(-found.fun - best.height)
+    return program.x[:n], float(-program.fun - best.height)

@@ -110,8 +110,8 @@ def sync_folder(folder: Path) -> None:
 class AppendedFile:
     """A file that grows by complete pieces.
 
-    A killed process loses none. A failure of power loses at most those of the last moments: the disk is waited for at
-    the first piece, then every `EACH` seconds, and at the end.
+    A killed process loses none. A failure of power may lose the pieces since the disk was last waited for: that is at
+    the first piece, at later ones if `EACH` seconds have passed, and at the end.
 
     Parameters
     ----------

@@ -6,6 +6,8 @@ load of the branch where it ends, at the same volume or displacement; or the dis
 
 from mpi4py import MPI
 
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, at_target, near_by
@@ -15,15 +17,11 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import LOCATED
 
-ALONE = "the run does not go on in another model"
 
-
-class Alone(NoResult):
-    """The run does not go on in another model."""
-
-
-def branched(first: Adapted, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
-    """Find the mesh of the larger model; collective.
+def branched(
+    first: Adapted, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None
+) -> Adapted | None:
+    """Find the mesh of the larger model; None if the run does not go on in another one. Collective.
 
     Parameters
     ----------
@@ -32,13 +30,14 @@ def branched(first: Adapted, comm: MPI.Comm, say: Say = lambda line: None, doing
 
     Raises
     ------
-    Alone
-        If the run does not go on in another model.
     NoResult
         If it ends there at no single load, or is lost.
     """
     doing("a mesh for the tolerance on the branch: the path on a coarse one")
-    choice, coarse = _first(first, comm)
+    begun = _first(first, comm)
+    if begun is None:
+        return None
+    choice, coarse = begun
     return rounds(coarse[0].problem, choice, coarse, _moved, say, doing, of=" on the branch")
 
 
@@ -56,9 +55,9 @@ def branch_error(chosen: Adapted, record: Record) -> float:
     return estimated(low.value, _moved(scene.problem, finer, (scene, low))[1].value)
 
 
-def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved]:
-    """The branch on the coarsest mesh where it has a result."""
-    lost: NoResult = Alone(ALONE)
+def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
+    """The branch on the coarsest mesh where it has a result; None without a branch."""
+    lost = NoResult("no mesh is fine enough")
     if first.asked.body or first.asked.given:
         raise NoResult("of a solid, or of several shells, nothing is carried between meshes")
     for refinement in FIRST:
@@ -75,7 +74,7 @@ def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved]:
             lost = NoResult(str(e))
             continue
         if last is None:
-            raise Alone(ALONE)
+            return None
         return choice, _ended(last)
     raise lost
 
@@ -91,7 +90,10 @@ def _ended(record: Record) -> tuple[Scene, Ending]:
 
 
 def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
-    scene = choice.scene(problem, near[0].comm)
+    try:
+        scene = choice.scene(problem, near[0].comm)
+    except (CaseError, MeshError) as e:
+        raise NoResult(str(e)) from None
     end = near_by(scene, *near)
     if end is None:
         raise NoResult("the end of the branch is not found on another mesh")
