@@ -128,7 +128,7 @@ def test_what_is_installed(installed: Installed) -> None:
     there = {file.relative_to(package / "examples").as_posix() for file in (package / "examples").rglob("*.*")}
     cases = {file.relative_to(TOP).as_posix() for file in examples().values()}
     beside = {"cases/arch_triangle.csv", *(f"cases/identify_{of}.csv" for of in ("arch", "field"))}
-    beside |= {f"meshes/{of}.msh" for of in ("bracket", "gripper", "gripper_closed", "stack")}
+    beside |= {f"meshes/{of}.msh" for of in ("bracket", "gripper", "gripper_closed", "stack", "strips")}
     assert there == cases | beside
 
 

@@ -9,7 +9,7 @@ from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.system import Vector
 
 ASIDE = 0.01  # of the range: how far beyond a crossing the other mode is taken up
-HALVINGS = 5  # of that distance, until the mode is found there
+HALVINGS = 7  # of that distance, until the mode is found there, and comes first
 
 
 def critical(
@@ -63,12 +63,20 @@ def critical(
 
 
 def _beyond(mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]) -> Locus:
-    """A point of a boundary near its crossing, at which its equations are singular."""
+    """A point of a boundary near its crossing, where its equations are singular: if possible the first instability."""
     room = (ends[1] if sense > 0 else ends[0]) - crossing.p
     off = copysign(min(ASIDE * mode.scales[1], abs(room) / 2), sense)
-    for _ in range(HALVINGS):
+    farthest: Locus | None = None
+    for halvings_left in range(HALVINGS, -1, -1):
         try:
-            return mode.start(crossing.p + off, crossing.state, phi)
+            start = mode.start(crossing.p + off, crossing.state, phi)
         except (BoundaryLost, NoSystem):
-            off /= 2
-    return mode.start(crossing.p + off, crossing.state, phi)
+            if not halvings_left and farthest is None:
+                raise
+        else:
+            if not start.unstable:
+                return start
+            farthest = farthest or start
+        off /= 2
+    assert farthest
+    return farthest

@@ -180,7 +180,8 @@ class Watch:
 
     Between two points several families may soften and recover. The tangents of the parabola through the last three
     looks are means of three matrices (its Bernstein coefficients): those at both ends and one between. If that one is
-    not positive definite for a family that is stable at both ends, the point half way gets a look, and so on.
+    not positive definite for a family that is stable at both ends, the point half way gets a look, and so on. It gets
+    one in the first interval of a path whose first point has one.
 
     Parameters
     ----------
@@ -298,28 +299,30 @@ class Watch:
             earlier = every[-2]
         return every
 
-    def _closer(self, earlier: _Look | None, low: _Look, high: _Look, halvings: int) -> Iterator[_Look]:
-        if not halvings or not self._may_recover(earlier, low, high):
+    def _closer(self, other: _Look | None, low: _Look, high: _Look, halvings: int) -> Iterator[_Look]:
+        """Looks between two, from a third one before or after these; without one the middle is looked at."""
+        if not halvings or not self._may_recover(other, low, high):
             return
         point = Step(self._path, low.point, high.point).middle()
         if point is None:
             return
         part, rest = (self._length(end.point, point) for end in (low, high))
         look = self._look(point, low.along + (high.along - low.along) * part / (part + rest))
-        yield from self._closer(earlier, low, look, halvings - 1)
+        yield from self._closer(other or high, low, look, halvings - 1)
         yield look
         yield from self._closer(low, look, high, halvings - 1)
 
-    def _may_recover(self, earlier: _Look | None, low: _Look, high: _Look) -> bool:
+    def _may_recover(self, other: _Look | None, low: _Look, high: _Look) -> bool:
         """Whether a family that is stable at both ends of a step may be unstable in it, by a parabola."""
         tangents = self._excluded.tangents if self._excluded else None
-        if not tangents or earlier is None or earlier.numbers is None or low.numbers is None or high.numbers is None:
+        if not tangents or low.numbers is None or high.numbers is None or high.along == low.along:
             return False
-        before, step = low.along - earlier.along, high.along - low.along
-        if not before or not step:
-            return False
-        slopes = (low.numbers - earlier.numbers) / before, (high.numbers - low.numbers) / step
-        between = low.numbers + step / 2 * (step * slopes[0] + before * slopes[1]) / (before + step)
+        if other is None or other.numbers is None or other.along in (low.along, high.along):
+            return True
+        step = high.along - low.along
+        slopes = (high.numbers - low.numbers) / step, (low.numbers - other.numbers) / (low.along - other.along)
+        bend = (slopes[0] - slopes[1]) / (high.along - other.along)  # half the second derivative
+        between = (low.numbers + high.numbers) / 2 - step**2 / 2 * bend
         return any(not low.counts[i] and not high.counts[i] for i in tangents.indefinite(between))
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:

@@ -1,6 +1,6 @@
 """A gripper that is its own image in the planes y = 0 and x = y: a hub of 1 x 1 with four arms of 3 x 0.5.
 
-python3 meshes/gripper_closed.py > meshes/gripper_closed.msh
+python3 meshes/scripts/gripper_closed.py > meshes/gripper_closed.msh
 
 Half an arm and an eighth of the hub are meshed, and turned and mirrored to eight of them.
 """
