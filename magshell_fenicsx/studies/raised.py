@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 FIRST, LARGEST = 0.25, 1.0  # half the side of the box, over the half ranges of variables, or in radians
 BENT = 0.3  # an old plane is at least so many squares of the distance above the best place, over its value at the start
 REMEMBERED = 60  # places whose planes count
-BROKEN = 10.0  # times what a constraint is broken by counts, beside the values
+BROKEN = 10.0, 1e6  # times what a constraint is broken by counts, beside the values; as often as it must, up to this
+KEPT = 1e-9  # a constraint that is broken by less is kept
 TAKEN, GOOD = 0.05, 0.7  # of the gain that was foreseen: a place is taken, the box grows
 ENOUGH = 1e-5  # a gain, over the value at the start
 
@@ -45,10 +46,9 @@ class _Place:
     kept: Array
     kept_slopes: Array
 
-    @property
-    def height(self) -> float:
-        """The lowest value, less what broken constraints count."""
-        return float(self.values.min() + BROKEN * self.kept.min(initial=0.0))
+    def height(self, broken: float) -> float:
+        """The lowest value, less what a broken constraint counts, times a factor."""
+        return float(self.values.min() + broken * self.kept.min(initial=0.0))
 
 
 def raise_lowest(
@@ -84,16 +84,22 @@ def raise_lowest(
         values, slopes = goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation)
         return _Place(x / span, values, slopes, kept, kept_slopes)
 
-    best, size = place(first), FIRST
+    best, size, (broken, most_broken) = place(first), FIRST, BROKEN
     assert best
     others: list[_Place] = []
     for _ in range(iterations):
         box = np.maximum(low / span - best.y, -size), np.minimum(high / span - best.y, size)
-        step, gain = _foreseen(best, others[-REMEMBERED:], box)
+        step, gain, left = _foreseen(best, others[-REMEMBERED:], box, broken)
+        while left > KEPT and broken < most_broken:
+            further = _foreseen(best, others[-REMEMBERED:], box, 10 * broken)
+            if further[2] > left / 2:  # all is done for the constraints that can be done in the box
+                break
+            broken, (step, gain, left) = 10 * broken, further
         if gain < ENOUGH:
-            return f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained"
+            near = f"within {size:.2g} of the variables' ranges"
+            return f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained {near}"
         tried = place(np.clip(span * (best.y + step), low, high))
-        part = (tried.height - best.height) / gain if tried else -np.inf
+        part = (tried.height(broken) - best.height(broken)) / gain if tried else -np.inf
         if part > TAKEN:
             assert tried
             best, tried = tried, best
@@ -105,8 +111,10 @@ def raise_lowest(
     return "iteration limit reached"
 
 
-def _foreseen(best: _Place, others: Sequence[_Place], box: tuple[Array, Array]) -> tuple[Array, float]:
-    """The step to the highest place under all planes, where constraints count as in `height`, and the gain."""
+def _foreseen(
+    best: _Place, others: Sequence[_Place], box: tuple[Array, Array], broken: float
+) -> tuple[Array, float, float]:
+    """The step to the highest place under all planes, see `_Place.height`; the gain; what constraints are broken by."""
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         away = best.y - other.y
@@ -117,9 +125,9 @@ def _foreseen(best: _Place, others: Sequence[_Place], box: tuple[Array, Array]) 
     under = np.column_stack([-np.vstack(slopes), np.ones(of_values), np.zeros(of_values)])
     within = np.column_stack([-best.kept_slopes, np.zeros(of_kept), -np.ones(of_kept)])
     program = scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
-        np.concatenate([np.zeros(n), [-1.0, BROKEN]]),
+        np.concatenate([np.zeros(n), [-1.0, broken]]),
         A_ub=np.vstack([under, within]),
         b_ub=np.concatenate([*planes, best.kept]),
         bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
     )
-    return program.x[:n], float(-program.fun - best.height)
+    return program.x[:n], float(-program.fun - best.height(broken)), float(program.x[-1])

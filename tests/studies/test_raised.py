@@ -71,3 +71,40 @@ def test_eigenvalues_that_cross(seed: int) -> None:
     assert "foreseen" in ended
     assert max(np.linalg.eigvalsh(goal.of(x))[0] for x in kept) == pytest.approx(most, abs=1e-3 * abs(most))
     assert np.linalg.eigvalsh(goal.of(tried[0]))[0] < most - 0.3
+
+
+@dataclass
+class Slight:
+    """1 + x0 - 0.1 x1^2, with the constraint b (0.1 - x0) >= 0, that hardly depends on the variables."""
+
+    b: float
+
+    def lowest_values(self, evaluation: Evaluation) -> Array:
+        return np.array([evaluation.values["raised"]])
+
+    def lowest_slopes(self, evaluation: Evaluation) -> Array:
+        return np.array([evaluation.gradients["raised"]])
+
+    def constraints(self, evaluation: Evaluation) -> Array:
+        return np.array([evaluation.values["kept"]])
+
+    def constraint_slopes(self, evaluation: Evaluation) -> Array:
+        return np.array([[-self.b, 0.0]])
+
+    def evaluated(self, x: Array) -> Evaluation:
+        values = {"raised": 1 + x[0] - 0.1 * x[1] ** 2, "kept": self.b * (0.1 - x[0])}
+        return Evaluation(values, {"raised": [1.0, -0.2 * x[1]]})
+
+
+@pytest.mark.parametrize("b", [0.2, 0.01])
+def test_a_constraint_that_hardly_depends_on_the_variables(b: float) -> None:
+    """The highest place is (0.1, 0), however small the slope of the constraint is."""
+    goal, tried = Slight(b), list[Array]()
+
+    def evaluate(x: Array) -> Evaluation:
+        tried.append(x)
+        return goal.evaluated(x)
+
+    raise_lowest(evaluate, goal, [(-1.0, 1.0)] * 2, np.array([0.0, 0.3]), 60)
+    kept = [x for x in tried if x[0] <= 0.1 + 1e-6]
+    assert max(1 + x[0] - 0.1 * x[1] ** 2 for x in kept) == pytest.approx(1.1, abs=1e-4)
