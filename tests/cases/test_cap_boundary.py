@@ -37,3 +37,12 @@ def test_deeper_caps_buckle_before_they_snap(tmp_path: Path) -> None:
         "snaps",
         "buckles with m = 1",
     }
+
+
+def test_a_region_narrower_than_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One wave comes first between 17.411 and 17.621 degrees alone; with two waves beyond, as runs say."""
+    monkeypatch.setattr("magshell_fenicsx.continuation.critical.ASIDE", 0.5)
+    found = ms.boundary(CASES / "cap_boundary.yaml", "shell.polar=17.3:17.8:1", ["shell.polar=17.3"], out=tmp_path)
+    assert [row["mode"] for row in found.special] == ["fold, m = 1", "m = 1, m = 2"]
+    assert found.special[1]["key"] == pytest.approx(17.621, abs=1e-3)
+    assert not any(row["unstable"] for row in found.rows)

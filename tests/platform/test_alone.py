@@ -26,7 +26,7 @@ if MPI.COMM_WORLD.rank == int(rank):
         words += ["--set", "shell.poisson_ratio=0.31"]
     if mode == "alone":
         from magshell_fenicsx.input.source import CaseError
-        def make_problem(*arguments):
+        def make_problem(*arguments, **others):
             raise CaseError("mesh: only here")
         planner.make_problem = make_problem
 sys.argv = ["magshell", *words]
