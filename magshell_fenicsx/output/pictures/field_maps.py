@@ -33,7 +33,7 @@ LINE_WIDTH, TINY = 0.6, 1e-300  # points: around the section of the shell, whose
 def field_maps_figure(
     maps: Sequence[tuple[Grid, float]], surface: Surface, h: float, case: Mapping[str, Any], style: OutputSection
 ) -> "Figure":
-    """Draw |B| in colours and the lines of the part in the plane; of a box the plane in the middle of its third side.
+    """Draw |B| in colours and the lines of the part in the plane; of a box the plane nearest to its middle.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def field_maps_figure(
 
 
 def plane_of(grid: Grid) -> Grid:
-    """The grid itself; of a box its layer in the middle of the third side."""
+    """The grid itself; of a box the layer that is nearest to the middle of its third side."""
     if len(grid.points) == 2:
         return grid
     nx, ny, nz = grid.points
@@ -119,7 +119,7 @@ def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: 
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.set(xlabel=_direction(units[0], R), ylabel=_direction(units[1], R))
-    axes.set_title(f"{grid.name.replace('_', ' ')}: {grid.words} field")
+    axes.set_title(f"{grid.name.replace('_', ' ')}: {grid.words} field{_place(grid, units, length, R)}")
     axes.figure.colorbar(image, ax=axes, label=f"$|B|$  {unit}", fraction=0.05)
     if not wide:
         axes.figure.axes[-1].yaxis.set_major_formatter(number_format())
@@ -135,6 +135,16 @@ def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: 
 def masked(values: Array) -> Any:
     """Values without those that are nan."""
     return np.ma.masked_array(values, np.isnan(values))  # type: ignore[no-untyped-call]
+
+
+def _place(grid: Grid, units: Array, length: float, R: float) -> str:
+    """Where a plane is, if it is one of x, y or z."""
+    e = np.abs(np.cross(*units))
+    number = int(e.argmax())
+    if e[number] < PARALLEL:
+        return ""
+    unit = "$R$" if isnan(R) else "mm"
+    return f", ${'xyz'[number]}$ = {length * grid.corner[number] + 0.0:.4g} {unit}"
 
 
 def _direction(e: Array, R: float) -> str:
