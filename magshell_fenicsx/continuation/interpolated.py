@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.interpolate import barycentric_interpolate
+import scipy
 
 
 def slope(places: Sequence[float]) -> list[tuple[float, float]]:
@@ -16,7 +16,7 @@ def slope(places: Sequence[float]) -> list[tuple[float, float]]:
 
 def interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
     """The value at `at` of the polynomial through the points (x, y)."""
-    return float(barycentric_interpolate(x, y, at))
+    return float(scipy.interpolate.barycentric_interpolate(x, y, at))
 
 
 def stationary(rise: float, d0: float, d1: float) -> float:
