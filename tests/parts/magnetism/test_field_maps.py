@@ -86,7 +86,7 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * np.pi * 0.19**0.5, rel=5e-3)
     figure = field_maps_figure([(box, R), (across, R)], surface, about.h, run.resolved, run.style)
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:2] == ["box: total field", "across: own field"]
+    assert titles[:2] == ["box: total field, $z$ = 17 mm", "across: own field, $y$ = 0 mm"]
     assert "field_maps_0001.png" in plot(out, 1)
     (out / "fields" / f"map_across_{points - 1:04d}.vtu").unlink()  # that point is written again if a run goes on
     assert FieldSeries(out / "fields", about, "", run.rows, ["box", "across"]).kept == points - 1
