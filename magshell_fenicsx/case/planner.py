@@ -347,9 +347,11 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         places = [np.array(x) for x in case.points.values()]
         if sector_of_waves := sector(parts, drawn, case.symmetry, places):
             return False, sector_of_waves
-        hint = "; the mesh file must be its own image in both, with each of its edges and patches"
-        hint = hint if isinstance(case.shell, MeshSurface) else ""
-        hint = "; each shell is held, and its own image in both" if case.several else hint
+        hint = ""
+        if case.several:
+            hint = "; each shell is held, and its own image in both"
+        elif isinstance(case.shell, MeshSurface):
+            hint = "; the mesh file must be its own image in both, with each of its edges and patches"
         raise CaseError(
             f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
             f"angle of {180 / case.symmetry:g} degrees with all named points between them{hint}"

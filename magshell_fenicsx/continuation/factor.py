@@ -141,8 +141,6 @@ class Factorisation:
 
     def count_beside(self) -> bool:
         """Count the negative pivots of K + D by the factors of K; False if D is not small beside it."""
-        if self.counted:
-            return self.doubt < np.inf
         tangent, remembered = self._beside, self._remembered
         if not tangent or not remembered:  # an earlier count failed
             return False

@@ -110,10 +110,10 @@ class Family(Protocol):
 class Tangents(Protocol):
     """Those of several families together, as numbers in which they are linear."""
 
-    def at(self, state: State) -> Vector:
-        """The numbers at a state of the model."""
+    def numbers(self, state: State) -> Vector:
+        """Those at a state of the model."""
 
-    def counts(self, numbers: Vector) -> Sequence[int]:
+    def counts_of(self, numbers: Vector) -> Sequence[int]:
         """Numbers of unstable directions of all families."""
 
     def indefinite(self, numbers: Vector) -> set[int]:
@@ -349,8 +349,8 @@ class Watch:
     def _look(self, point: Point, along: float) -> _Look:
         state = self._expand(point.state)
         if self._excluded and (tangents := self._excluded.tangents):
-            numbers = tangents.at(state)
-            return _Look(point, along, tuple(tangents.counts(numbers)), numbers=numbers)
+            numbers = tangents.numbers(state)
+            return _Look(point, along, tuple(tangents.counts_of(numbers)), numbers=numbers)
         if self._excluded is None or len(self._families) != 1:
             return _Look(point, along, tuple(self._excluded.counts(state)) if self._excluded else ())
         factors = self._families[0].factor_at(state)

@@ -126,25 +126,25 @@ class Waves:
         between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
         assembled. Only those that are not positive definite are factored for their inertia.
         """
-        return self.counts_of(self.at_nodes(state))
+        return self.counts_of(self.numbers(state))
 
-    def at_nodes(self, state: State) -> NDArray[np.float64]:
+    def numbers(self, state: State) -> NDArray[np.float64]:
         """(5, entries) of the matrices at the five m."""
         of_nodes = self._system.at(state).assembled(lambda: self._entries(state, self._nodes[:3]))
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
     def counts_of(self, values: NDArray[np.float64]) -> list[int]:
-        """See `counts`, from `at_nodes`."""
+        """See `counts`, from `numbers`."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
 
-    def indefinite(self, values: NDArray[np.float64]) -> list[int]:
-        """The waves of matrices as `at_nodes` gives them that are not positive definite."""
+    def indefinite(self, values: NDArray[np.float64]) -> set[int]:
+        """m - 1 of the waves whose matrices, as `numbers` gives them, are not positive definite."""
         pieces = self._pieces
         try:
-            return self._indefinite(values)
+            return {m - 1 for m in self._indefinite(values)}
         finally:
             self._pieces = pieces  # fit for states of the path
 
@@ -304,9 +304,9 @@ class ExcludedWaves:
         return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
     @property
-    def tangents(self) -> "TangentsOfWaves":
+    def tangents(self) -> Waves:
         """For a `Watch`."""
-        return TangentsOfWaves(self.waves)
+        return self.waves
 
     def counts(self, state: State) -> Sequence[int]:
         """Numbers of unstable directions of all families at a state."""
@@ -315,22 +315,3 @@ class ExcludedWaves:
     def is_unstable(self, state: State) -> bool:
         """Whether some wave is unstable at an axisymmetric state."""
         return any(self.waves.counts(state))
-
-
-@dataclass(frozen=True)
-class TangentsOfWaves:
-    """Of all numbers of waves; a `continuation.watch.Tangents`."""
-
-    waves: Waves
-
-    def at(self, state: State) -> NDArray[np.float64]:
-        """The numbers at an axisymmetric state."""
-        return self.waves.at_nodes(state)
-
-    def counts(self, numbers: NDArray[np.float64]) -> Sequence[int]:
-        """Numbers of unstable directions for m = 1, 2, ..."""
-        return self.waves.counts_of(numbers)
-
-    def indefinite(self, numbers: NDArray[np.float64]) -> set[int]:
-        """m - 1 of those that are not positive definite."""
-        return {m - 1 for m in self.waves.indefinite(numbers)}

@@ -119,7 +119,7 @@ class Scene:
         The record of the solver's results for an interrupted run, and the listener to its status. The caller that
         runs the scene sets both.
     meshed
-        What gives a larger model, to which a mode hands over, its mesh; by default it has that of its case.
+        Changes the mesh of a larger model to which a mode hands over; by default that of the case stays.
     warnings
         What is unphysical, or may be too large.
     loose

@@ -175,9 +175,6 @@ class Varied:
                 raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
 
     @cached_property
-    def _start(self) -> tuple[State, Vector]:
-        return self.start()
-
     def start(self) -> tuple[State, Vector]:
         """The instability in the unknowns of the family, and a null vector.
 
@@ -393,7 +390,7 @@ class Varied:
 
     def _forces(self, stage: Stage, p: float) -> Vector:
         """At the instability, with other numbers: residual, load, and the tangent along the null vector."""
-        system, (state, phi) = stage.newton.system, self._start
+        system, (state, phi) = stage.newton.system, self.start
         mu = {**self._fixed(stage, p), self.name: state.mu[self.name]}
         here = State(state.u, mu)
         if self.m:

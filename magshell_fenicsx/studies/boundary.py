@@ -328,7 +328,7 @@ def _followed(
 
     try:
         mode = curve(varied.m)
-        start = mode.start(value, *varied.start())
+        start = mode.start(value, *varied.start)
         rows.append(_row(varied, "start", start, mode))
         for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
             take(label, locus, on)
