@@ -67,6 +67,15 @@ KINDS = {
     "saturating": lambda: made(
         PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "applied": FIELD}, loading=TURNED, **SIZED
     ),
+    "half, saturating, by formula, thickness": lambda: made(
+        {**STRIP, "thickness_factor": "1 + x/2"}, {"root": "clamped"},
+        {"susceptibility": "2 + x", "saturation": "0.5 T", "applied": FIELD}, symmetry="half",
+    ),
+    "meridian, saturating, sources": lambda: made(
+        RING, {"inner": "clamped"}, {"susceptibility": 2, "saturation": "0.1 T",
+                                     "applied": {"sources": [{**MAGNET, "position": [0, 0, -0.02]}]}},
+        symmetry="axisymmetric", loading=[MOVED[0], MOVED[3]],
+    ),
     "solid, saturating": lambda: made(
         PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "remanent": REMANENT, "applied": G},
         model="solid", mesh={"size": 0.015},
@@ -91,10 +100,7 @@ def rough(kind: str) -> tuple[Any, np.ndarray, dict[str, float]]:
     return system, u, {name: 0.3 + 0.1 * i for i, name in enumerate(sorted(mu))}
 
 
-SLOW = "solid, saturating"  # its kernels take two minutes to compile
-
-
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k == SLOW else k for k in KINDS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_derivatives(kind: str) -> None:
     """Residual, tangent, load columns, conjugates and their derivatives by all amplitudes, by central differences."""
     system, u, mu = rough(kind)
@@ -148,14 +154,20 @@ def test_a_plate_in_a_tilted_field(model: str) -> None:
     np.testing.assert_allclose([row[f"induced_{axis}"] for axis in "xyz"], J, rtol=1e-9, atol=1e-12)
 
 
-def test_models_agree() -> None:
+@pytest.mark.parametrize("saturation", [None, pytest.param("10 mT", marks=pytest.mark.slow)])
+def test_models_agree(saturation: str | None) -> None:
     """A soft disc in a graded field along its axis: meridian, half and full, and the polarisation of each."""
-    shell = {"geometry": "disc", "radius_to_thickness": 40, "poisson_ratio": 0.3}
-    magnetic = {
+    shell: dict[str, Any] = {"geometry": "disc", "radius_to_thickness": 40, "poisson_ratio": 0.3}
+    magnetic: dict[str, Any] = {
         "susceptibility": 2,
         "lambda_m": 0.02,
         "applied": {"polar": 0, "gradient": [[-0.5, 0, 0], [0, -0.5, 0], [0, 0, 1]]},
     }
+    if saturation:
+        shell = {"geometry": "disc", "radius": "30 mm", "thickness": "0.75 mm", "youngs_modulus": "1 MPa"}
+        shell["poisson_ratio"] = 0.3
+        applied = magnetic["applied"] | {"flux_density": "22 mT"}
+        magnetic = {"susceptibility": 2, "saturation": saturation, "applied": applied}
     rows = []
     for symmetry in ("axisymmetric", "half", "none"):
         case = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "symmetry": symmetry}
