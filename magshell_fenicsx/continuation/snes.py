@@ -25,6 +25,8 @@ SMALL = 1e-3  # full Newton steps below this size shrink, unless they are roundi
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
+STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
+SURE = 0.5  # of the tolerance: an error that is foreseen; a kept matrix shrinks its second step half as well as its first
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
@@ -167,12 +169,28 @@ class Iterates:
         Matrices after which steps must have shrunk.
     searched
         Whether a line search shortens them: then they may grow.
+    kinks
+        Whether steps may shrink suddenly less: then none is foreseen.
     """
 
     largest: float = np.inf
     patience: int = 4
     searched: bool = False
+    kinks: bool = False
     steps: list[Step] = field(default_factory=list)
+
+    @property
+    def foreseen(self) -> float:
+        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
+        if self.kinks or self.searched or len(self.steps) < 2:
+            return np.inf
+        rate = self.steps[-1].size / self.steps[-2].size
+        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
+
+    @property
+    def error(self) -> float:
+        """The estimated error after the last step."""
+        return min(self.steps[-1].size, self.foreseen) if self.steps else np.inf
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
         """The verdict on the iterate, from the last step.
@@ -187,7 +205,7 @@ class Iterates:
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
             return "diverged"
-        if step.size <= tolerance:
+        if min(step.size, self.foreseen / SURE) <= tolerance:
             return "converged"
         full = [s.size for s in before if s.own]
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
@@ -222,14 +240,14 @@ class Linearised:
         self._tolerance = tolerance
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
-        self._iterates = Iterates(self._options.largest_step, patience, searched)
+        self._iterates = Iterates(self._options.largest_step, patience, searched, self._options.kinks)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 
     @property
     def error(self) -> float:
-        """The estimated error of the last iterate."""
-        return self._iterates.steps[-1].size if self._iterates.steps else np.inf
+        """The estimated error of the solution."""
+        return self._iterates.error
 
     def step_at(self, x: PETSc.Vec) -> Direction | None:
         """The next step at an iterate, to be subtracted; None where none was computed."""
