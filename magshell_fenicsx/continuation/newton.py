@@ -86,7 +86,14 @@ class BorderedNewton:
         return self._work.iterations
 
     def solve(
-        self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = (), *, search: bool = True
+        self,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted] = (),
+        *,
+        search: bool = True,
+        near: float = 0.0,
     ) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
@@ -96,16 +103,20 @@ class BorderedNewton:
             As that of `System.tangent`, of the guess.
         search
             Whether a line search is tried where full steps fail and forces set in within a step.
+        near
+            Distance from the guess, in lengths, up to which the factors of another state begin the solve.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress)
+        outcome = self._solved(self._snes, guess, name, row, stress, near)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome
 
-    def _solved(self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted]) -> Outcome:
-        linear = self._linear
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=snes is self._searching)
+    def _solved(
+        self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted], near: float = 0.0
+    ) -> Outcome:
+        linear, searched = self._linear, snes is self._searching
+        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=searched, near=near)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()

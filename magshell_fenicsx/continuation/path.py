@@ -27,6 +27,7 @@ GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
 VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
+CLOSE, NEAR = 1e-3, 0.05  # in lengths: old factors begin a solve up to here; the second where nobody counts with them
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -246,7 +247,7 @@ class Path:
                 length = min(length, self._past_fold(passed, length))
                 cubic, quintic = self._missed(passed)
                 smooth = quintic < cubic
-                if smooth:
+                if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 tried = self._try(s, passed[-3:] if smooth else passed[-2:])
@@ -297,8 +298,10 @@ class Path:
     def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
         *earlier, here = passed
-        if len(earlier) < 3:
+        if len(earlier) < 2:
             return np.inf, np.inf
+        if len(earlier) < 3:
+            return self._distance(earlier, here), np.inf
         return self._distance(earlier[-2:], here), self._distance(earlier[-3:], here)
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
@@ -393,7 +396,8 @@ class Path:
 
     def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN)
+        near = CLOSE if counted else NEAR
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before

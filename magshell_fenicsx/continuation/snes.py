@@ -105,6 +105,16 @@ class Tangents:
         state, count = self._made
         return state if count == self._factorisation.count else None
 
+    @property
+    def latest(self) -> Factorisation:
+        """The latest factors."""
+        return self._factorisation
+
+    def near(self, state: State, most: float) -> bool:
+        """Whether the latest factors belong to a state not farther from another one than so many lengths."""
+        mine, system = self.state, self.system
+        return mine is not None and max_abs(system.comm, state.u - mine.u) <= most * system.length
+
     def at(
         self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False, sure: bool = True
     ) -> Factorisation:
@@ -211,7 +221,7 @@ class Iterates:
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
-        if step.own and len(before) > 2 and step.size > 2 * full[-1] and not self.searched:
+        if step.own and len(before) > 2 and full and step.size > 2 * full[-1] and not self.searched:
             return "diverged"
         if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
@@ -234,10 +244,18 @@ class Linearised:
         self._ahead: Direction | None = None
 
     def begin(
-        self, guess: State, name: str, row: Row, stress: Sequence[Weighted], tolerance: float, *, searched: bool = False
+        self,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted],
+        tolerance: float,
+        *,
+        searched: bool = False,
+        near: float = 0.0,
     ) -> None:
         """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
-        self._tolerance = tolerance
+        self._tolerance, self._near = tolerance, near
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
         self._iterates = Iterates(self._options.largest_step, patience, searched, self._options.kinks)
@@ -319,19 +337,20 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
+        own = bool(steps) or not self._tangents.near(state, self._near)
         anew = sum(step.own for step in steps) == OLD
-        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False)
+        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False) if own else self._tangents.latest
         matrix = Bordered(self._system, factors, state, self._name, self._row)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
-        steps.append(Step(matrix.size(step), own=True))
+        steps.append(Step(matrix.size(step), own=own))
         return step
 
     def _serves(self, size: float) -> bool:
         """Whether a kept matrix serves that makes a next step of this size."""
         steps, o = self._iterates.steps, self._options
         ratio = size / steps[-1].size
-        first = sum(step.own for step in steps) == 1 and not self._followed
+        first = sum(step.own for step in steps) <= 1 and not self._followed
         ends = ratio <= 0.5 and size * ratio**o.cheap <= self._tolerance and not self._followed
         return ends or ratio <= (o.contraction if first else o.hard)
 

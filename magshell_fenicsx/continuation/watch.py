@@ -49,7 +49,7 @@ class Step:
     def middle(self) -> Point | None:
         """The point half way between the first and the last one; None if it is not found."""
         try:
-            return self._middle(self._points[0], self._points[-1], solve=True)
+            return self._middle(self._points[0], self._points[-1], solve=True, counted=False)
         except PathStopped:
             return None
 
@@ -76,7 +76,7 @@ class Step:
             yield from self._between(low, middle, change, counts, halvings - 1)
             yield from self._between(middle, high, change, counts, halvings - 1)
 
-    def _middle(self, low: Point, high: Point, *, solve: bool) -> Point | None:
+    def _middle(self, low: Point, high: Point, *, solve: bool, counted: bool = True) -> Point | None:
         """A point between two others: a known one, else a new one if `solve` is set."""
         first, last = (next(i for i, p in enumerate(self._points) if p is end) for end in (low, high))
         if last - first > 1:
@@ -84,7 +84,7 @@ class Step:
         if not solve:
             return None
         path, s = self._path, (low.s + high.s) / 2
-        middle = path.inside(s, low, path.seen_from(low, high), self._low)
+        middle = path.inside(s, low, path.seen_from(low, high), self._low, counted=counted)
         if isinstance(middle, str):
             raise PathStopped(f"locating an instability: {middle}", low)
         return self._kept(middle)
