@@ -94,6 +94,7 @@ class BorderedNewton:
         *,
         search: bool = True,
         near: float = 0.0,
+        most: float = np.inf,
     ) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
@@ -105,18 +106,27 @@ class BorderedNewton:
             Whether a line search is tried where full steps fail and forces set in within a step.
         near
             Distance from the guess, in lengths, up to which the factors of another state begin the solve.
+        most
+            A longer step, in lengths, shows that the guess is not near enough; so does a second matrix with a longer one.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress, near)
+        outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome
 
     def _solved(
-        self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted], near: float = 0.0
+        self,
+        snes: Any,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted],
+        near: float = 0.0,
+        most: float = np.inf,
     ) -> Outcome:
         linear, searched = self._linear, snes is self._searching
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=searched, near=near)
+        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=searched, near=near, most=most)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()
@@ -132,7 +142,14 @@ class BorderedNewton:
         return self._tangents.at(state, stress)
 
     def response(
-        self, state: State, name: str, row: Row, *, exact: bool = False, anew: bool = False, counted: bool = True
+        self,
+        state: State,
+        name: str,
+        row: Row,
+        *,
+        within: float | None = None,
+        anew: bool = False,
+        counted: bool = True,
     ) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
@@ -140,8 +157,9 @@ class BorderedNewton:
 
         Parameters
         ----------
-        exact
-            Whether K is factored at the solution itself; a small part of it may be older.
+        within
+            Distance in lengths up to which factors of another state serve; zero if K is factored at the solution
+            itself, though a small part of it may be older.
         anew
             Whether no part may be older.
         counted
@@ -149,7 +167,7 @@ class BorderedNewton:
         """
         comm, near = self.system.comm, self._tangents.state
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
-        serves = moved <= self.options.fresh and not (exact or anew)
+        serves = 0.0 < (within if within is not None else self.options.fresh) >= moved and not anew
         fresh = serves and (not counted or self._tangents.certain)
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)

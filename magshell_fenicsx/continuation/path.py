@@ -11,7 +11,7 @@ import numpy as np
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
-from magshell_fenicsx.continuation.snes import HIDDEN
+from magshell_fenicsx.continuation.snes import FAR, HIDDEN
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
 Quantity = Literal["load", "conjugate"]
@@ -28,6 +28,8 @@ WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
 VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
 CLOSE, NEAR = 1e-3, 0.05  # in lengths: old factors begin a solve up to here; the second where nobody counts with them
+WILD, LEAST_MOST = 3.0, 0.1  # of the way to a first guess, and in lengths: a longer step of Newton's method is given up
+BEGUN = 1e-5  # in lengths: the end of a path has factors of its own, which serve the begin of the next one
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -131,7 +133,7 @@ class Path:
         sense
             The sign of dmu/ds with control by arc length.
         """
-        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
+        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), within=BEGUN)
         if not np.isfinite(dot(self.system.comm, response.du, response.du)):
             raise NotANumber("the tangent at its begin is not a number")
         if self.control == "arc":
@@ -140,16 +142,18 @@ class Path:
             s, rate = self.value(self.control, state), 1.0 if self.control == "load" else response.softness
         return self._point(state, s, response).per(rate)
 
-    def at(self, s: float, guess: State, base: Point) -> Point | str:
+    def at(self, s: float, guess: State, base: Point, *, most: float = np.inf) -> Point | str:
         """The point at `s`, or the reason why the solve failed.
 
         Parameters
         ----------
         base
             Arc length is measured from this point, along its tangent.
+        most
+            See `BorderedNewton.solve`.
         """
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
-        return self.solve(self._row(s, base), s, guess, stress)
+        return self.solve(self._row(s, base), s, guess, stress, most=most)
 
     def inside(self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True) -> Point | str:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
@@ -171,14 +175,21 @@ class Path:
         return self.as_base(again)
 
     def solve(
-        self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = (), *, counted: bool = True
+        self,
+        row: Row,
+        s: float,
+        guess: State,
+        stress: Sequence[Weighted] = (),
+        *,
+        counted: bool = True,
+        most: float = np.inf,
     ) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
 
         Unless it shall be `counted`, its number of unstable directions means nothing.
         """
-        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted))
-        self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
+        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted, most))
+        self._hard += point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
 
@@ -349,7 +360,9 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        point = self.at(s, self._extended(s, passed), here)
+        guess = self._extended(s, passed)
+        moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
+        point = self.at(s, guess, here, most=max(WILD * moved, LEAST_MOST))
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
@@ -394,22 +407,24 @@ class Path:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
-    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
+    def _solve(
+        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool, most: float
+    ) -> Point | str:
         before = self.newton.factorisation.count
         near = CLOSE if counted else NEAR
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near)
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near, most=most)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
-        exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
+        within = 0.0 if self._hard >= MANY else None  # the extrapolated stress is only as good as the tangent
+        response = self.newton.response(outcome.state, self.name, row, within=within, counted=counted)
         point = self._point(outcome.state, s, response)
         return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
-        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
+        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, within=0.0))
         spent = point.factorisations + 1
         return replace(again, iterations=point.iterations, factorisations=spent, error=point.error)
 

@@ -24,24 +24,28 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
+STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
 SURE = 0.5  # of the tolerance: an error that is foreseen; a kept matrix shrinks its second step half as well as its first
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
+FAR = "the first guess is too far away"
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
-Verdict = Literal["go on", "converged", "diverged", "rounding"]
+Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 Reason = PETSc.SNES.ConvergedReason
 REASON_OF: dict[Verdict, Any] = {
     "go on": Reason.CONVERGED_ITERATING,
     "converged": Reason.CONVERGED_SNORM_RELATIVE,
     "diverged": Reason.DIVERGED_DTOL,
+    "far": Reason.DIVERGED_LOCAL_MIN,
     "rounding": Reason.DIVERGED_INNER,
 }
 IN_WORDS = {
     Reason.DIVERGED_DTOL: "the iteration diverged",
+    Reason.DIVERGED_LOCAL_MIN: FAR,
     Reason.DIVERGED_INNER: HIDDEN,
     Reason.DIVERGED_MAX_IT: "too many iterations",
     Reason.DIVERGED_LINE_SEARCH: "the line search failed",
@@ -161,10 +165,13 @@ class Step:
         Size of the step, see `Bordered.size`.
     own
         Whether the matrix was computed at this iterate.
+    pivots
+        Its negative ones.
     """
 
     size: float
     own: bool
+    pivots: int = 0
 
 
 @dataclass
@@ -181,12 +188,15 @@ class Iterates:
         Whether a line search shortens them: then they may grow.
     kinks
         Whether steps may shrink suddenly less: then none is foreseen.
+    hasty
+        Whether the solve is given up early where a shorter step of the path costs less.
     """
 
     largest: float = np.inf
     patience: int = 4
     searched: bool = False
     kinks: bool = False
+    hasty: bool = False
     steps: list[Step] = field(default_factory=list)
 
     @property
@@ -214,10 +224,12 @@ class Iterates:
         """
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
-            return "diverged"
+            return "far" if self.hasty else "diverged"
         if min(step.size, self.foreseen / SURE) <= tolerance:
             return "converged"
         full = [s.size for s in before if s.own]
+        if self.hasty and step.own and self._astray([s for s in before if s.own], step):
+            return "far"
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
@@ -227,6 +239,12 @@ class Iterates:
             return "diverged"
         return "go on"
 
+
+    def _astray(self, before: Sequence[Step], step: Step) -> bool:
+        """Whether steps with matrices of their own lead away, past an instability, or stay long."""
+        if len(before) == 1:
+            return step.size > FULL * before[0].size and step.pivots != before[0].pivots
+        return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
 
 class Linearised:
     """What SNES calls in a solve: function, Jacobian, linear solver and test of convergence.
@@ -253,12 +271,15 @@ class Linearised:
         *,
         searched: bool = False,
         near: float = 0.0,
+        most: float = np.inf,
     ) -> None:
         """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
         self._tolerance, self._near = tolerance, near
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
-        self._iterates = Iterates(self._options.largest_step, patience, searched, self._options.kinks)
+        o = self._options
+        kinks = o.kinks or bool(self._system.coordinates)  # the force of a body is stiff
+        self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, hasty=most < np.inf)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 
@@ -343,7 +364,7 @@ class Linearised:
         matrix = Bordered(self._system, factors, state, self._name, self._row)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
-        steps.append(Step(matrix.size(step), own=own))
+        steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))
         return step
 
     def _serves(self, size: float) -> bool:
