@@ -373,7 +373,8 @@ class Linearised:
         ratio = size / steps[-1].size
         first = sum(step.own for step in steps) <= 1 and not self._followed
         ends = ratio <= 0.5 and size * ratio**o.cheap <= self._tolerance and not self._followed
-        return ends or ratio <= (o.contraction if first else o.hard)
+        late = first and len(steps) > 1 and size <= o.contraction**2 * steps[-2].size  # Broyden's steps shrink unevenly
+        return ends or late or ratio <= (o.contraction if first else o.hard)
 
     def _rounding(self, state: State, f: PETSc.Vec) -> float:
         """The error from rounding of the residual, estimated from its change when u is rounded differently."""
