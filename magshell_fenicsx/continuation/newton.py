@@ -137,6 +137,24 @@ class BorderedNewton:
         reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
         return Outcome(guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error)
 
+    def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:
+        """A guess after one step with the factors that stand; None if there are none, or if the step is too long.
+
+        Parameters
+        ----------
+        most
+            In lengths.
+        """
+        if self._tangents.state is None:
+            return None
+        system = self.system
+        matrix = Bordered(system, self.factorisation, guess, name, row)
+        step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess), rough=True)
+        if not matrix.size(step) <= most:
+            return None
+        u, mu = plus((guess.u, guess.mu[name]), -1.0, step)
+        return guess.with_(u, name, mu)
+
     def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are known."""
         return self._tangents.at(state, stress)

@@ -30,6 +30,7 @@ VAIN = 5  # failures one after the other, after which no line search is tried: a
 CLOSE, NEAR = 1e-3, 0.05  # in lengths: old factors begin a solve up to here; the second where nobody counts with them
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a first guess, and in lengths: a longer step of Newton's method is given up
 BEGUN = 1e-5  # in lengths: the end of a path has factors of its own, which serve the begin of the next one
+ABOUT = 0.01  # in lengths: a last step of Newton's method to where a state is looked at, but no point of the path is made
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -160,6 +161,18 @@ class Path:
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         return self.solve(self._row(s, base), s, self.between(s, low, high), stress, counted=counted)
+
+    def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
+        """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
+
+        def find() -> Point | str:
+            guess = self.between(s, low, high)
+            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT)
+            t = (s - low.s) / (high.s - low.s)
+            along = Response((1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu, 0.0, low.negative_pivots)
+            return self._point(state, s, along) if state else FAR
+
+        return self.recorded(find)
 
     def renewed(self, point: Point, state: State) -> Point:
         """The point at the same s with other amplitudes beside that of the path, from a state near it.

@@ -27,7 +27,7 @@ DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an ear
 STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
-SURE = 0.5  # of the tolerance: an error that is foreseen; a kept matrix shrinks its second step half as well as its first
+SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
@@ -225,7 +225,7 @@ class Iterates:
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
             return "far" if self.hasty else "diverged"
-        if min(step.size, self.foreseen / SURE) <= tolerance:
+        if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
             return "converged"
         full = [s.size for s in before if s.own]
         if self.hasty and step.own and self._astray([s for s in before if s.own], step):

@@ -53,6 +53,12 @@ class Step:
         except PathStopped:
             return None
 
+    def about_middle(self) -> Point | None:
+        """About that point, without a solve; None if that is too uncertain."""
+        low, high = self._points[0], self._points[-1]
+        found = self._path.about((low.s + high.s) / 2, low, self._path.seen_from(low, high), low)
+        return None if isinstance(found, str) else found
+
     def crossings(self, change: Change) -> Iterator[tuple[Point, int]]:
         """Each point at which a mode is neutral, and the change of the number of unstable directions there."""
         ends = self._points[0], self._points[-1]
@@ -303,14 +309,25 @@ class Watch:
         """Looks between two, from a third one before or after these; without one the middle is looked at."""
         if not halvings or not self._may_recover(other, low, high):
             return
-        point = Step(self._path, low.point, high.point).middle()
-        if point is None:
+        step = Step(self._path, low.point, high.point)
+        about = self._look_between(low, high, step.about_middle())
+        if about and about.counts == low.counts == high.counts:
+            ends = (other or high, low, about), (low, about, high)
+            if not any(self._may_recover(*three) for three in ends):
+                yield about
+                return
+        look = self._look_between(low, high, step.middle())
+        if look is None:
             return
-        part, rest = (self._length(end.point, point) for end in (low, high))
-        look = self._look(point, low.along + (high.along - low.along) * part / (part + rest))
         yield from self._closer(other or high, low, look, halvings - 1)
         yield look
         yield from self._closer(low, look, high, halvings - 1)
+
+    def _look_between(self, low: _Look, high: _Look, point: Point | None) -> _Look | None:
+        if point is None:
+            return None
+        part, rest = (self._length(end.point, point) for end in (low, high))
+        return self._look(point, low.along + (high.along - low.along) * part / (part + rest))
 
     def _may_recover(self, other: _Look | None, low: _Look, high: _Look) -> bool:
         """Whether a family that is stable at both ends of a step may be unstable in it, by a parabola."""
