@@ -137,16 +137,18 @@ class BorderedNewton:
         reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
         return Outcome(guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error)
 
-    def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:
-        """A guess after one step with the factors that stand; None if there are none, or if the step is too long.
+    def corrected(self, guess: State, name: str, row: Row, most: float, near: State) -> State | None:
+        """A guess after one step with the factors that stand; None if the step is too long.
 
         Parameters
         ----------
         most
             In lengths.
+        near
+            A state whose tangent is factored where no factors stand, as in a resumed run.
         """
         if self._tangents.state is None:
-            return None
+            self._tangents.at(near, sure=False)
         system = self.system
         matrix = Bordered(system, self.factorisation, guess, name, row)
         step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess), rough=True)
@@ -160,14 +162,7 @@ class BorderedNewton:
         return self._tangents.at(state, stress)
 
     def response(
-        self,
-        state: State,
-        name: str,
-        row: Row,
-        *,
-        within: float | None = None,
-        anew: bool = False,
-        counted: bool = True,
+        self, state: State, name: str, row: Row, *, exact: bool = False, anew: bool = False, counted: bool = True
     ) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
@@ -175,9 +170,8 @@ class BorderedNewton:
 
         Parameters
         ----------
-        within
-            Distance in lengths up to which factors of another state serve; zero if K is factored at the solution
-            itself, though a small part of it may be older.
+        exact
+            Whether K is factored at the solution itself; a small part of it may be older.
         anew
             Whether no part may be older.
         counted
@@ -185,7 +179,7 @@ class BorderedNewton:
         """
         comm, near = self.system.comm, self._tangents.state
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
-        serves = 0.0 < (within if within is not None else self.options.fresh) >= moved and not anew
+        serves = moved <= self.options.fresh and not (exact or anew)
         fresh = serves and (not counted or self._tangents.certain)
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)

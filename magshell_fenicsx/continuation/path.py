@@ -27,10 +27,11 @@ GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
 VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
-CLOSE, NEAR = 1e-3, 0.05  # in lengths: old factors begin a solve up to here; the second where nobody counts with them
+NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a first guess, and in lengths: a longer step of Newton's method is given up
-BEGUN = 1e-5  # in lengths: the end of a path has factors of its own, which serve the begin of the next one
-ABOUT = 0.01  # in lengths: a last step of Newton's method to where a state is looked at, but no point of the path is made
+ABOUT = (
+    0.01  # in lengths: a last step of Newton's method to where a state is looked at, but no point of the path is made
+)
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -134,7 +135,7 @@ class Path:
         sense
             The sign of dmu/ds with control by arc length.
         """
-        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), within=BEGUN)
+        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
         if not np.isfinite(dot(self.system.comm, response.du, response.du)):
             raise NotANumber("the tangent at its begin is not a number")
         if self.control == "arc":
@@ -167,7 +168,7 @@ class Path:
 
         def find() -> Point | str:
             guess = self.between(s, low, high)
-            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT)
+            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT, high.state)
             t = (s - low.s) / (high.s - low.s)
             along = Response((1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu, 0.0, low.negative_pivots)
             return self._point(state, s, along) if state else FAR
@@ -424,20 +425,20 @@ class Path:
         self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool, most: float
     ) -> Point | str:
         before = self.newton.factorisation.count
-        near = CLOSE if counted else NEAR
+        near = 0.0 if counted else NEAR  # a tangent of the path must not depend on what was factored before its point
         outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near, most=most)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
-        within = 0.0 if self._hard >= MANY else None  # the extrapolated stress is only as good as the tangent
-        response = self.newton.response(outcome.state, self.name, row, within=within, counted=counted)
+        exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
+        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
         point = self._point(outcome.state, s, response)
         return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
-        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, within=0.0))
+        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
         spent = point.factorisations + 1
         return replace(again, iterations=point.iterations, factorisations=spent, error=point.error)
 

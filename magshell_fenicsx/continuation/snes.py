@@ -239,12 +239,12 @@ class Iterates:
             return "diverged"
         return "go on"
 
-
     def _astray(self, before: Sequence[Step], step: Step) -> bool:
         """Whether steps with matrices of their own lead away, past an instability, or stay long."""
         if len(before) == 1:
             return step.size > FULL * before[0].size and step.pivots != before[0].pivots
         return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
+
 
 class Linearised:
     """What SNES calls in a solve: function, Jacobian, linear solver and test of convergence.

@@ -138,7 +138,7 @@ def trace(
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     if control == "conjugate":
-        moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), within=0.0).du
+        moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), exact=True).du
         if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
             raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
     path, first_point = plain(scene).begin(name, control, rest.state, first, 10 * first)

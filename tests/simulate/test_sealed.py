@@ -31,7 +31,7 @@ state = device.leave(end.state)
 open_ = newton.solve(rest, "weight", GivenLoad("weight", load))
 volume = GivenConjugate(system, "pressure", 0.0)
 closed = newton.solve(open_.state, "pressure", volume)
-direct = newton.response(closed.state, "pressure", volume, within=0.0)
+direct = newton.response(closed.state, "pressure", volume, exact=True)
 held = direct.negative_pivots - (direct.softness < 0)
 if scene.comm.rank == 0:
     print(json.dumps({"pressure": state.mu["pressure"], "again": closed.state.mu["pressure"],

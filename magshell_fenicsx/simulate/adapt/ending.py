@@ -327,7 +327,7 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     if not outcome.converged:
         return None
     state = outcome.state
-    tangent = newton.response(state, name, row, within=0.0).du
+    tangent = newton.response(state, name, row, exact=True).du
     return Ending("target", name, _value(system, state, name, held), state, tangent, held)
 
 
