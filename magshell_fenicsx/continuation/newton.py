@@ -107,7 +107,7 @@ class BorderedNewton:
         near
             Distance from the guess, in lengths, up to which the factors of another state begin the solve.
         most
-            A longer step, in lengths, shows that the guess is not near enough; so does a second matrix with a longer one.
+            A longer step, in lengths, ends the solve early, and so do steps that lead astray: see `Iterates.hasty`.
         """
         outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:

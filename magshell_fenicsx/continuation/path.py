@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from math import prod
 from typing import Literal
 
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
+from magshell_fenicsx.continuation.interpolated import hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
 from magshell_fenicsx.continuation.snes import FAR, HIDDEN
@@ -28,10 +28,8 @@ WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
 VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
 NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
-WILD, LEAST_MOST = 3.0, 0.1  # of the way to a first guess, and in lengths: a longer step of Newton's method is given up
-ABOUT = (
-    0.01  # in lengths: a last step of Newton's method to where a state is looked at, but no point of the path is made
-)
+WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
+ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -75,17 +73,6 @@ class _Far:
     reason: str
     exact: bool
     looks: int = 0
-
-
-def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
-    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial through all of them."""
-    weights = []
-    for i, a in enumerate(nodes):
-        others = [*nodes[:i], *nodes[i + 1 :]]
-        square = prod((s - b) / (a - b) for b in others) ** 2
-        bend = 2 * sum(1 / (a - b) for b in others)
-        weights.append((square * (1 - bend * (s - a)), square * (s - a)))
-    return weights
 
 
 class NotANumber(RuntimeError):
@@ -152,7 +139,7 @@ class Path:
         base
             Arc length is measured from this point, along its tangent.
         most
-            See `BorderedNewton.solve`.
+            As of `BorderedNewton.solve`.
         """
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
         return self.solve(self._row(s, base), s, guess, stress, most=most)
@@ -323,11 +310,8 @@ class Path:
     def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
         *earlier, here = passed
-        if len(earlier) < 2:
-            return np.inf, np.inf
-        if len(earlier) < 3:
-            return self._distance(earlier, here), np.inf
-        return self._distance(earlier[-2:], here), self._distance(earlier[-3:], here)
+        missed = [self._distance(earlier[-n:], here) if len(earlier) >= n else np.inf for n in (2, 3)]
+        return missed[0], missed[1]
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
         """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""

@@ -227,8 +227,9 @@ class Iterates:
             return "far" if self.hasty else "diverged"
         if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
             return "converged"
-        full = [s.size for s in before if s.own]
-        if self.hasty and step.own and self._astray([s for s in before if s.own], step):
+        own = [s for s in before if s.own]
+        full = [s.size for s in own]
+        if self.hasty and step.own and self._astray(own, step):
             return "far"
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
