@@ -1,6 +1,7 @@
 """Polynomials through some points."""
 
 from collections.abc import Sequence
+from math import prod
 
 import numpy as np
 import scipy
@@ -25,3 +26,14 @@ def stationary(rise: float, d0: float, d1: float) -> float:
     inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
     t = inside[0] if inside else d0 / (d0 - d1)
     return float(min(max(t, 1e-3), 1 - 1e-3))
+
+
+def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
+    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial through all of them."""
+    weights = []
+    for i, a in enumerate(nodes):
+        others = [*nodes[:i], *nodes[i + 1 :]]
+        square = prod((s - b) / (a - b) for b in others) ** 2
+        bend = 2 * sum(1 / (a - b) for b in others)
+        weights.append((square * (1 - bend * (s - a)), square * (s - a)))
+    return weights

@@ -86,7 +86,15 @@ class BorderedNewton:
         return self._work.iterations
 
     def solve(
-        self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = (), *, search: bool = True
+        self,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted] = (),
+        *,
+        search: bool = True,
+        near: float = 0.0,
+        most: float = np.inf,
     ) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
@@ -96,16 +104,29 @@ class BorderedNewton:
             As that of `System.tangent`, of the guess.
         search
             Whether a line search is tried where full steps fail and forces set in within a step.
+        near
+            Distance from the guess, in lengths, up to which the factors of another state begin the solve.
+        most
+            A longer step, in lengths, ends the solve early, and so do steps that lead astray: see `Iterates.hasty`.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress)
+        outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome
 
-    def _solved(self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted]) -> Outcome:
-        linear = self._linear
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=snes is self._searching)
+    def _solved(
+        self,
+        snes: Any,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted],
+        near: float = 0.0,
+        most: float = np.inf,
+    ) -> Outcome:
+        linear, searched = self._linear, snes is self._searching
+        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=searched, near=near, most=most)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()
@@ -115,6 +136,26 @@ class BorderedNewton:
         self._work.iterations += iterations
         reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
         return Outcome(guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error)
+
+    def corrected(self, guess: State, name: str, row: Row, most: float, near: State) -> State | None:
+        """A guess after one step with the factors that stand; None if the step is too long.
+
+        Parameters
+        ----------
+        most
+            In lengths.
+        near
+            A state whose tangent is factored where no factors stand, as in a resumed run.
+        """
+        if self._tangents.state is None:
+            self._tangents.at(near, sure=False)
+        system = self.system
+        matrix = Bordered(system, self.factorisation, guess, name, row)
+        step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess), rough=True)
+        if not matrix.size(step) <= most:
+            return None
+        u, mu = plus((guess.u, guess.mu[name]), -1.0, step)
+        return guess.with_(u, name, mu)
 
     def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are known."""

@@ -3,15 +3,15 @@
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from math import prod
 from typing import Literal
 
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
+from magshell_fenicsx.continuation.interpolated import hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
-from magshell_fenicsx.continuation.snes import HIDDEN
+from magshell_fenicsx.continuation.snes import FAR, HIDDEN
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
 Quantity = Literal["load", "conjugate"]
@@ -27,6 +27,9 @@ GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
 VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
+NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
+WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
+ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -70,17 +73,6 @@ class _Far:
     reason: str
     exact: bool
     looks: int = 0
-
-
-def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
-    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial through all of them."""
-    weights = []
-    for i, a in enumerate(nodes):
-        others = [*nodes[:i], *nodes[i + 1 :]]
-        square = prod((s - b) / (a - b) for b in others) ** 2
-        bend = 2 * sum(1 / (a - b) for b in others)
-        weights.append((square * (1 - bend * (s - a)), square * (s - a)))
-    return weights
 
 
 class NotANumber(RuntimeError):
@@ -139,22 +131,36 @@ class Path:
             s, rate = self.value(self.control, state), 1.0 if self.control == "load" else response.softness
         return self._point(state, s, response).per(rate)
 
-    def at(self, s: float, guess: State, base: Point) -> Point | str:
+    def at(self, s: float, guess: State, base: Point, *, most: float = np.inf) -> Point | str:
         """The point at `s`, or the reason why the solve failed.
 
         Parameters
         ----------
         base
             Arc length is measured from this point, along its tangent.
+        most
+            As of `BorderedNewton.solve`.
         """
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
-        return self.solve(self._row(s, base), s, guess, stress)
+        return self.solve(self._row(s, base), s, guess, stress, most=most)
 
     def inside(self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True) -> Point | str:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         return self.solve(self._row(s, base), s, self.between(s, low, high), stress, counted=counted)
+
+    def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
+        """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
+
+        def find() -> Point | str:
+            guess = self.between(s, low, high)
+            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT, high.state)
+            t = (s - low.s) / (high.s - low.s)
+            along = Response((1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu, 0.0, low.negative_pivots)
+            return self._point(state, s, along) if state else FAR
+
+        return self.recorded(find)
 
     def renewed(self, point: Point, state: State) -> Point:
         """The point at the same s with other amplitudes beside that of the path, from a state near it.
@@ -170,14 +176,21 @@ class Path:
         return self.as_base(again)
 
     def solve(
-        self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = (), *, counted: bool = True
+        self,
+        row: Row,
+        s: float,
+        guess: State,
+        stress: Sequence[Weighted] = (),
+        *,
+        counted: bool = True,
+        most: float = np.inf,
     ) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
 
         Unless it shall be `counted`, its number of unstable directions means nothing.
         """
-        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted))
-        self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
+        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted, most))
+        self._hard += point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
 
@@ -246,7 +259,7 @@ class Path:
                 length = min(length, self._past_fold(passed, length))
                 cubic, quintic = self._missed(passed)
                 smooth = quintic < cubic
-                if smooth:
+                if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 tried = self._try(s, passed[-3:] if smooth else passed[-2:])
@@ -297,9 +310,8 @@ class Path:
     def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
         *earlier, here = passed
-        if len(earlier) < 3:
-            return np.inf, np.inf
-        return self._distance(earlier[-2:], here), self._distance(earlier[-3:], here)
+        missed = [self._distance(earlier[-n:], here) if len(earlier) >= n else np.inf for n in (2, 3)]
+        return missed[0], missed[1]
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
         """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""
@@ -346,7 +358,9 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        point = self.at(s, self._extended(s, passed), here)
+        guess = self._extended(s, passed)
+        moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
+        point = self.at(s, guess, here, most=max(WILD * moved, LEAST_MOST))
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
@@ -391,9 +405,12 @@ class Path:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
-    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
+    def _solve(
+        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool, most: float
+    ) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN)
+        near = 0.0 if counted else NEAR  # a tangent of the path must not depend on what was factored before its point
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near, most=most)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before

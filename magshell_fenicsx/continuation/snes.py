@@ -24,22 +24,28 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
+STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
+STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
+SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
+FAR = "the first guess is too far away"
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
-Verdict = Literal["go on", "converged", "diverged", "rounding"]
+Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 Reason = PETSc.SNES.ConvergedReason
 REASON_OF: dict[Verdict, Any] = {
     "go on": Reason.CONVERGED_ITERATING,
     "converged": Reason.CONVERGED_SNORM_RELATIVE,
     "diverged": Reason.DIVERGED_DTOL,
+    "far": Reason.DIVERGED_LOCAL_MIN,
     "rounding": Reason.DIVERGED_INNER,
 }
 IN_WORDS = {
     Reason.DIVERGED_DTOL: "the iteration diverged",
+    Reason.DIVERGED_LOCAL_MIN: FAR,
     Reason.DIVERGED_INNER: HIDDEN,
     Reason.DIVERGED_MAX_IT: "too many iterations",
     Reason.DIVERGED_LINE_SEARCH: "the line search failed",
@@ -103,6 +109,16 @@ class Tangents:
         state, count = self._made
         return state if count == self._factorisation.count else None
 
+    @property
+    def latest(self) -> Factorisation:
+        """The latest factors."""
+        return self._factorisation
+
+    def near(self, state: State, most: float) -> bool:
+        """Whether the latest factors belong to a state not farther from another one than so many lengths."""
+        mine, system = self.state, self.system
+        return mine is not None and max_abs(system.comm, state.u - mine.u) <= most * system.length
+
     def at(
         self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False, sure: bool = True
     ) -> Factorisation:
@@ -149,10 +165,13 @@ class Step:
         Size of the step, see `Bordered.size`.
     own
         Whether the matrix was computed at this iterate.
+    pivots
+        Its negative ones.
     """
 
     size: float
     own: bool
+    pivots: int = 0
 
 
 @dataclass
@@ -167,12 +186,31 @@ class Iterates:
         Matrices after which steps must have shrunk.
     searched
         Whether a line search shortens them: then they may grow.
+    kinks
+        Whether steps may shrink suddenly less: then none is foreseen.
+    hasty
+        Whether the solve is given up early where a shorter step of the path costs less.
     """
 
     largest: float = np.inf
     patience: int = 4
     searched: bool = False
+    kinks: bool = False
+    hasty: bool = False
     steps: list[Step] = field(default_factory=list)
+
+    @property
+    def foreseen(self) -> float:
+        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
+        if self.kinks or self.searched or len(self.steps) < 2:
+            return np.inf
+        rate = self.steps[-1].size / self.steps[-2].size
+        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
+
+    @property
+    def error(self) -> float:
+        """The estimated error after the last step."""
+        return min(self.steps[-1].size, self.foreseen) if self.steps else np.inf
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
         """The verdict on the iterate, from the last step.
@@ -186,18 +224,27 @@ class Iterates:
         """
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
-            return "diverged"
-        if step.size <= tolerance:
+            return "far" if self.hasty else "diverged"
+        if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
             return "converged"
-        full = [s.size for s in before if s.own]
+        own = [s for s in before if s.own]
+        full = [s.size for s in own]
+        if self.hasty and step.own and self._astray(own, step):
+            return "far"
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
-        if step.own and len(before) > 2 and step.size > 2 * full[-1] and not self.searched:
+        if step.own and len(before) > 2 and full and step.size > 2 * full[-1] and not self.searched:
             return "diverged"
         if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
         return "go on"
+
+    def _astray(self, before: Sequence[Step], step: Step) -> bool:
+        """Whether steps with matrices of their own lead away, past an instability, or stay long."""
+        if len(before) == 1:
+            return step.size > FULL * before[0].size and step.pivots != before[0].pivots
+        return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
 
 
 class Linearised:
@@ -216,20 +263,31 @@ class Linearised:
         self._ahead: Direction | None = None
 
     def begin(
-        self, guess: State, name: str, row: Row, stress: Sequence[Weighted], tolerance: float, *, searched: bool = False
+        self,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted],
+        tolerance: float,
+        *,
+        searched: bool = False,
+        near: float = 0.0,
+        most: float = np.inf,
     ) -> None:
         """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
-        self._tolerance = tolerance
+        self._tolerance, self._near = tolerance, near
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
-        self._iterates = Iterates(self._options.largest_step, patience, searched)
+        o = self._options
+        kinks = o.kinks or bool(self._system.coordinates)  # the force of a body is stiff
+        self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, hasty=most < np.inf)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 
     @property
     def error(self) -> float:
-        """The estimated error of the last iterate."""
-        return self._iterates.steps[-1].size if self._iterates.steps else np.inf
+        """The estimated error of the solution."""
+        return self._iterates.error
 
     def step_at(self, x: PETSc.Vec) -> Direction | None:
         """The next step at an iterate, to be subtracted; None where none was computed."""
@@ -301,21 +359,23 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
+        own = bool(steps) or not self._tangents.near(state, self._near)
         anew = sum(step.own for step in steps) == OLD
-        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False)
+        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False) if own else self._tangents.latest
         matrix = Bordered(self._system, factors, state, self._name, self._row)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
-        steps.append(Step(matrix.size(step), own=True))
+        steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))
         return step
 
     def _serves(self, size: float) -> bool:
         """Whether a kept matrix serves that makes a next step of this size."""
         steps, o = self._iterates.steps, self._options
         ratio = size / steps[-1].size
-        first = sum(step.own for step in steps) == 1 and not self._followed
+        first = sum(step.own for step in steps) <= 1 and not self._followed
         ends = ratio <= 0.5 and size * ratio**o.cheap <= self._tolerance and not self._followed
-        return ends or ratio <= (o.contraction if first else o.hard)
+        late = first and len(steps) > 1 and size <= o.contraction**2 * steps[-2].size  # Broyden's steps shrink unevenly
+        return ends or late or ratio <= (o.contraction if first else o.hard)
 
     def _rounding(self, state: State, f: PETSc.Vec) -> float:
         """The error from rounding of the residual, estimated from its change when u is rounded differently."""

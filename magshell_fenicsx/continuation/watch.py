@@ -49,9 +49,15 @@ class Step:
     def middle(self) -> Point | None:
         """The point half way between the first and the last one; None if it is not found."""
         try:
-            return self._middle(self._points[0], self._points[-1], solve=True)
+            return self._middle(self._points[0], self._points[-1], solve=True, counted=False)
         except PathStopped:
             return None
+
+    def about_middle(self) -> Point | None:
+        """About that point, without a solve; None if that is too uncertain."""
+        low, high = self._points[0], self._points[-1]
+        found = self._path.about((low.s + high.s) / 2, low, self._path.seen_from(low, high), low)
+        return None if isinstance(found, str) else found
 
     def crossings(self, change: Change) -> Iterator[tuple[Point, int]]:
         """Each point at which a mode is neutral, and the change of the number of unstable directions there."""
@@ -76,7 +82,7 @@ class Step:
             yield from self._between(low, middle, change, counts, halvings - 1)
             yield from self._between(middle, high, change, counts, halvings - 1)
 
-    def _middle(self, low: Point, high: Point, *, solve: bool) -> Point | None:
+    def _middle(self, low: Point, high: Point, *, solve: bool, counted: bool = True) -> Point | None:
         """A point between two others: a known one, else a new one if `solve` is set."""
         first, last = (next(i for i, p in enumerate(self._points) if p is end) for end in (low, high))
         if last - first > 1:
@@ -84,7 +90,7 @@ class Step:
         if not solve:
             return None
         path, s = self._path, (low.s + high.s) / 2
-        middle = path.inside(s, low, path.seen_from(low, high), self._low)
+        middle = path.inside(s, low, path.seen_from(low, high), self._low, counted=counted)
         if isinstance(middle, str):
             raise PathStopped(f"locating an instability: {middle}", low)
         return self._kept(middle)
@@ -303,14 +309,25 @@ class Watch:
         """Looks between two, from a third one before or after these; without one the middle is looked at."""
         if not halvings or not self._may_recover(other, low, high):
             return
-        point = Step(self._path, low.point, high.point).middle()
-        if point is None:
+        step = Step(self._path, low.point, high.point)
+        about = self._look_between(low, high, step.about_middle())
+        if about and about.counts == low.counts == high.counts:
+            ends = (other or high, low, about), (low, about, high)
+            if not any(self._may_recover(*three) for three in ends):
+                yield about
+                return
+        look = self._look_between(low, high, step.middle())
+        if look is None:
             return
-        part, rest = (self._length(end.point, point) for end in (low, high))
-        look = self._look(point, low.along + (high.along - low.along) * part / (part + rest))
         yield from self._closer(other or high, low, look, halvings - 1)
         yield look
         yield from self._closer(low, look, high, halvings - 1)
+
+    def _look_between(self, low: _Look, high: _Look, point: Point | None) -> _Look | None:
+        if point is None:
+            return None
+        part, rest = (self._length(end.point, point) for end in (low, high))
+        return self._look(point, low.along + (high.along - low.along) * part / (part + rest))
 
     def _may_recover(self, other: _Look | None, low: _Look, high: _Look) -> bool:
         """Whether a family that is stable at both ends of a step may be unstable in it, by a parabola."""
