@@ -23,6 +23,7 @@ from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
+from magshell_fenicsx.assembly.whole import WholeTerm
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, State, Vector, Weighted, symmetric_part
 from magshell_fenicsx.platform import compat
@@ -150,8 +151,9 @@ class FiniteElementSystem:
             self.moving.put(whole, mu)
         return whole
 
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return Evaluated(self, u, mu).residual()
+    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
+        """See `System` and `Roughly`."""
+        return Evaluated(self, u, mu).residual(rough=rough)
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """See `Evaluated.forces`."""
@@ -338,16 +340,21 @@ class FiniteElementSystem:
         return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = ()
+        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = (), *, rough: bool = False
     ) -> NDArray[np.float64]:
-        """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
+        """This rank's part of the gradient of the terms with these factors, by name, plus further terms.
+
+        If `rough`, those in which all unknowns act on each other may be foreseen.
+        """
         with self.assembly:
             b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
             if self.gradients and factors:
                 self.gradients.add(b, factors)
             own = [(factors.get(t.name, 0.0), t) for t in self._own_residual]
             for factor, term in itertools.chain(own, besides):
-                if factor:
+                if factor and rough and isinstance(term, WholeTerm):
+                    term.add_foreseen(b, factor)
+                elif factor:
                     term.add_residual(b, factor)
             return b
 

@@ -48,6 +48,9 @@ class WholeTerm(Term, Protocol):
     def acting(self, *, rough: bool = False) -> Acting:
         """d2Pi/du2; if `rough`, it may be that of an earlier state. Collective."""
 
+    def add_foreseen(self, b: Array, factor: float) -> None:
+        """As `add_residual`, by what is known of states near by; collective."""
+
 
 @dataclass(frozen=True)
 class OfTerm:

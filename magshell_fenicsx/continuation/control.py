@@ -5,7 +5,7 @@ The bordered matrix is inverted by block elimination; Broyden's update goes on w
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from math import sqrt
 from typing import Generic, Protocol, TypeVar
@@ -14,7 +14,16 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    Direction,
+    Roughly,
+    State,
+    System,
+    Vector,
+    dot,
+    max_abs,
+)
 
 MOST_REFINEMENTS = 4
 REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
@@ -23,6 +32,7 @@ COARSE = 1e-4  # beside a tangent: a correction that such differences give well
 LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
 
 V = TypeVar("V")
+Residual = Callable[[Vector, Amplitudes], Vector]
 
 
 class Row(Protocol):
@@ -229,22 +239,48 @@ class Chord(Generic[V]):
 
 
 def refined_tangent(
-    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row
+    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row, *, foreseeing: bool = False
 ) -> Direction | None:
     """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
 
-    None if the matrix is too far away.
+    If `foreseeing`, with forces that are foreseen, then known along the tangent itself. None if the matrix is too far away.
     """
+    if not foreseeing:
+        refined = _refined(system.residual, system, matrix, t, t, state, load, row)
+        return refined[0] if refined else None
+    assert isinstance(system, Roughly)
+    residual, first = partial(system.residual, rough=True), t
+    for known in range(MOST_REFINEMENTS):
+        refined = _refined(residual, system, matrix, first, t, state, load, row)
+        if refined is None or (known and refined[1] == 0):
+            return refined[0] if refined else None
+        t = refined[0]
+        _stiffness(system.residual, system, state, t[0], t[0])  # what is foreseen from now on is right along t
+    return None
+
+
+def _refined(
+    residual: Residual,
+    system: System,
+    matrix: Bordered,
+    first: Direction,
+    t: Direction,
+    state: State,
+    load: Vector,
+    row: Row,
+) -> tuple[Direction, int] | None:
+    """The tangent from one that is nearly as good, and the number of products; `first` is that of the matrix."""
     comm, gradient = system.comm, row.gradient(state)
-    R = system.residual(state.u, state.mu)
+    R = residual(state.u, state.mu)
 
     def times(t: Direction) -> Direction:
-        return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
+        return matrix.solve(_stiffness(residual, system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
 
-    z, directions = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
+    z, directions = plus(first, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
     for _ in range(MOST_REFINEMENTS):
         if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-            return plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
+            t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
+            return t, len(directions)
         p, q = z, times(z)
         for before, image, square in directions:
             part = matrix.inner(image, q) / square
@@ -255,10 +291,7 @@ def refined_tangent(
     return None
 
 
-def _stiffness(system: System, state: State, R: Vector, du: Vector) -> Vector:
+def _stiffness(residual: Residual, system: System, state: State, R: Vector, du: Vector) -> Vector:
     """K du by a difference of the residual; R is the residual at the state."""
-    size = max_abs(system.comm, du)
-    if size == 0.0:
-        return du
-    small = DIFFERENCE * system.length / size
-    return np.asarray((system.residual(state.u + small * du, state.mu) - R) / small)
+    small = DIFFERENCE * system.length / (max_abs(system.comm, du) or 1.0)
+    return np.asarray((residual(state.u + small * du, state.mu) - R) / small)

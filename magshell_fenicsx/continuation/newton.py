@@ -97,15 +97,19 @@ class BorderedNewton:
         search
             Whether a line search is tried where full steps fail and forces set in within a step.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress)
+        outcome = self._solved(self._snes, guess, name, row, stress, foreseeing=self._tangents.foresees)
+        if not outcome.converged and self._linear.foreseeing:
+            outcome = self._solved(self._snes, guess, name, row, stress)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome
 
-    def _solved(self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted]) -> Outcome:
-        linear = self._linear
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=snes is self._searching)
+    def _solved(
+        self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted], *, foreseeing: bool = False
+    ) -> Outcome:
+        linear, how = self._linear, {"searched": snes is self._searching, "foreseeing": foreseeing}
+        linear.begin(guess, name, row, stress, snes.getTolerances()[2], **how)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()
@@ -143,7 +147,9 @@ class BorderedNewton:
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         if (moved and fresh) or self._tangents.rough:
-            refined = refined_tangent(self.system, matrix, tangent, state, load, row)
+            refined = refined_tangent(
+                self.system, matrix, tangent, state, load, row, foreseeing=self._tangents.foresees
+            )
             if refined is None:
                 return self.response(state, name, row, anew=True)
             tangent = refined

@@ -7,7 +7,7 @@ the stiff part of a structure hides errors of its soft part.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
+FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
@@ -118,6 +119,11 @@ class Tangents:
                 factors.factor(self.system.tangent(state.u, state.mu, stress))
             self._made, self._stressed = (state, factors.count), bool(stress)
         return factors
+
+    @property
+    def foresees(self) -> bool:
+        """Whether a part of the forces may be foreseen from states before: it is small, and was so far."""
+        return isinstance(self.system, Roughly) and self.system.dear and self._factorisation.knows
 
     @property
     def certain(self) -> bool:
@@ -216,9 +222,18 @@ class Linearised:
         self._ahead: Direction | None = None
 
     def begin(
-        self, guess: State, name: str, row: Row, stress: Sequence[Weighted], tolerance: float, *, searched: bool = False
+        self,
+        guess: State,
+        name: str,
+        row: Row,
+        stress: Sequence[Weighted],
+        tolerance: float,
+        *,
+        searched: bool = False,
+        foreseeing: bool = False,
     ) -> None:
-        """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
+        """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`."""
+        self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
         self._tolerance = tolerance
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
@@ -237,8 +252,16 @@ class Linearised:
 
     def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """R and g."""
-        state = self._state_of(x)
-        self.join((self._system.residual(state.u, state.mu), self._row.residual(state)), f)
+        self._foreseen = self.foreseeing
+        self._compute(self._state_of(x), f)
+
+    def _compute(self, state: State, f: PETSc.Vec) -> None:
+        if self._foreseen:
+            assert isinstance(self._system, Roughly)
+            R = self._system.residual(state.u, state.mu, rough=True)
+        else:
+            R = self._system.residual(state.u, state.mu)
+        self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
         """The matrix for an iterate: that of an earlier one while the steps shrink."""
@@ -261,9 +284,11 @@ class Linearised:
         """Whether the next step is small enough, or will never be."""
         x, f = snes.getSolution(), snes.getFunction()[0]
         state = self._linearise(x, f)
-        length = self._system.length
-        scale = max(1.0, MOTION * max_abs(self._system.comm, state.u) / length)
-        return REASON_OF[self._iterates.judge(self._tolerance * scale, lambda: self._rounding(state, f))]
+        return REASON_OF[self._iterates.judge(self._least(state), lambda: self._rounding(state, f))]
+
+    def _least(self, state: State) -> float:
+        """The size of a step that counts as converged."""
+        return self._tolerance * max(1.0, MOTION * max_abs(self._system.comm, state.u) / self._system.length)
 
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
         """Choose the matrix for an iterate, and compute its next step; once for each iterate."""
@@ -273,9 +298,24 @@ class Linearised:
         if before is not None:
             self._go_on(before, state)
         self._at, self._state = x.stateGet(), state
-        self._handle, self._residual = f.handle, f.stateGet()
         self._ahead = self._next_step(state, self.split(f))
+        size = self.error
+        if self._foreseen and not size > max(self._least(state), FORESEEN * self._ventured):
+            self._foreseen = False
+            self._compute(state, f)
+            self._ahead, size = self._again(self.split(f)), self.error
+            self._ventured = size
+        self._ventured = max(self._ventured, size)
+        self._handle, self._residual = f.handle, f.stateGet()
         return state
+
+    def _again(self, f: Direction) -> Direction:
+        """The next step by the same matrix, in place of one with foreseen forces."""
+        assert self.matrix
+        assert self._chord
+        step = self._chord.step(f)
+        self._iterates.steps[-1] = replace(self._iterates.steps[-1], size=self.matrix.size(step))
+        return step
 
     def _go_on(self, before: State, state: State) -> None:
         """The iterate has moved, by the whole step unless a line search has made it shorter."""

@@ -140,6 +140,9 @@ class Roughly(Protocol):
     @property
     def dear(self) -> bool: ...
 
+    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
+        """As that of `System`; if `rough`, forces of that part may be foreseen from states before."""
+
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Tangent:
         """As that of `System`; if `rough`, that part may be that of an earlier state."""
 
