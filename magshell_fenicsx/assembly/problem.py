@@ -5,8 +5,9 @@ has from its history stands in it, and goes on by `FiniteElementSystem.advance` 
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -29,6 +30,9 @@ from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, Sta
 from magshell_fenicsx.platform import compat
 
 Setting: TypeAlias = tuple[Settable, float]  # a number of the terms, and its value in a state that has none
+
+
+DIFFERENCE = 1e-5  # of the length: the step of differences of forces
 
 
 class FiniteElementSystem:
@@ -307,12 +311,29 @@ class FiniteElementSystem:
         N = self._skew(factors)
         if self.of_all:
             K = self.of_all.beside(K, factors, rough=rough)
+            if isinstance(K, Beside) and rough:
+                K = replace(K, present=self._present_of_all({t.name: factors[t.name] for t in self.of_all.terms}))
             K = symmetric_part(K) if N or self.projection or self.noise else K
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
         return Skewed(K, N) if N else K
+
+    def _present_of_all(self, factors: Mapping[str, float]) -> Callable[[Vector], Vector]:
+        """The tangent of some terms, at the displacement that is set now, times a vector: by differences of forces."""
+        u = np.array(self.u.x.array)
+
+        def times(v: Vector) -> Vector:
+            step, along = self.step_along(v, DIFFERENCE), self.with_ghosts(v)
+            before, product = np.array(self.u.x.array), np.zeros(self.size)
+            for way in (1.0, -1.0):
+                self.u.x.array[:] = u + way * step * along
+                product += way / (2 * step) * self._summed(self._gradient(factors))
+            self.u.x.array[:] = before
+            return product
+
+        return times
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""

@@ -5,7 +5,8 @@ an eigenvalue nu < -1 of A makes it singular once, at t = -1/nu, with the vector
 where x . D x < 0, else one less. So the inertia of K is that of K0 and what the few eigenvalues of A below -1 add.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -18,7 +19,7 @@ LEAST, MOST = 4, 30  # products with A for them: as many as show that there are 
 RUNS = 6  # with what was found before left out: eigenvalues may be multiple
 SURE = 0.1  # error of an eigenvalue over its distance from -1
 TOLERANCE, ACCEPTED = 1e-12, 1e-7  # of a solution's rest, over the first one; the second where rounding hides more
-ROUGH = 3e-3  # the first of these of a step of Newton's method
+ROUGH = 3e-2  # the first of these of a step of Newton's method
 KEPT = 40  # products with D that are remembered
 DEPENDENT = 1e-12  # square of the part of a vector that others do not have
 Array = NDArray[np.float64]
@@ -132,10 +133,60 @@ class Solver:
         return u, c
 
 
-def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tuple[int, float] | None:
-    """How many more negative eigenvalues K0 + D has than K0, and the doubt; None if A has too many large ones.
+@dataclass(frozen=True)
+class Crossings:
+    """How many more negative eigenvalues K0 + D has than K0.
 
-    The doubt is the largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is the same.
+    Attributes
+    ----------
+    doubt
+        The largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is the same.
+    large
+        Vectors of the eigenvalues beyond `SMALL`.
+    """
+
+    more: int
+    doubt: float
+    large: list[Vector]
+
+
+class Corrected:
+    """D where it is of an earlier state, with what it lacks along some vectors, and symmetric.
+
+    With F X = Y for k vectors X, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C with
+    C X = 1, here C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates from X.
+
+    Parameters
+    ----------
+    lacks
+        Y.
+    """
+
+    def __init__(
+        self, D: Rest, X: Sequence[Vector], lacks: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm
+    ) -> None:
+        self._D, self._comm = D, comm
+        self._X, self._Y, self._KX = (np.column_stack(each) for each in (X, lacks, KX))
+        self._M = comm.allreduce(self._X.T @ self._KX)
+        between = comm.allreduce(self._X.T @ self._Y)
+        self._between = (between + between.T) / 2
+
+    def apart(self, v: Vector) -> Vector:
+        """What is left of a vector without X, where K separates both."""
+        return np.asarray(v - self._X @ self._along(v))
+
+    def times(self, v: Vector) -> Vector:
+        """(D + F) v. Collective."""
+        c, y = self._along(v), self._comm.allreduce(self._Y.T @ v)
+        back = np.linalg.solve(self._M.T, y - self._between @ c)
+        return np.asarray(self._D.times(v) + self._Y @ c + self._KX @ back)
+
+    def _along(self, v: Vector) -> Array:
+        return np.asarray(np.linalg.solve(self._M, self._comm.allreduce(self._KX.T @ v)))
+
+
+def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> Crossings | None:
+    """How many more negative eigenvalues K0 + D has than K0; None if A has too many large ones.
 
     Parameters
     ----------
@@ -166,7 +217,7 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
                 return None
         doubt = max(doubt, float((np.abs(values) / np.abs(1 + values)).max()))
         if not len(far):
-            return more, doubt
+            return Crossings(more, doubt, out)
         for i in far[values[far].imag >= 0]:  # of a conjugate pair one
             parts = [vectors[:, i].real, vectors[:, i].imag] if values[i].imag > 0 else [vectors[:, i].real]
             vectors_of_value = [krylov.combined(part) for part in parts]

@@ -152,14 +152,18 @@ class Bordered:
     ----------
     column
         R_mu.
+    rough
+        Whether a small part of K is that of an earlier state, so that its solutions need not be better.
     """
 
-    def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
-        self.state, self.row, self._mu = state, row, state.mu[name]
+    def __init__(
+        self, system: System, factors: Factorisation, state: State, name: str, row: Row, *, rough: bool = False
+    ) -> None:
+        self.state, self.row, self.rough, self._mu = state, row, rough, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        self._x2 = factors.solve(self.column)
+        self._x2 = factors.solve(self.column, rough=rough)
         self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
         self._weight = dot(self._comm, self._x2, self._x2)  # dmu counts as the displacement that it causes
 
@@ -243,55 +247,60 @@ def refined_tangent(
 ) -> Direction | None:
     """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
 
-    If `foreseeing`, with forces that are foreseen, then known along the tangent itself. None if the matrix is too far away.
+    If `foreseeing`, with forces that are foreseen, and computed along the tangent itself. None if the matrix is too far
+    away.
     """
+    near = _Near(system, matrix, state, load, row)
     if not foreseeing:
-        refined = _refined(system.residual, system, matrix, t, t, state, load, row)
+        refined = near.refined(system.residual, t)
         return refined[0] if refined else None
     assert isinstance(system, Roughly)
-    residual, first = partial(system.residual, rough=True), t
     for known in range(MOST_REFINEMENTS):
-        refined = _refined(residual, system, matrix, first, t, state, load, row)
+        refined = near.refined(partial(system.residual, rough=True), t)
         if refined is None or (known and refined[1] == 0):
             return refined[0] if refined else None
         t = refined[0]
-        _stiffness(system.residual, system, state, t[0], t[0])  # what is foreseen from now on is right along t
+        near.stiffness(system.residual, t[0], t[0])  # what is foreseen from now on is right along t
     return None
 
 
-def _refined(
-    residual: Residual,
-    system: System,
-    matrix: Bordered,
-    first: Direction,
-    t: Direction,
-    state: State,
-    load: Vector,
-    row: Row,
-) -> tuple[Direction, int] | None:
-    """The tangent from one that is nearly as good, and the number of products; `first` is that of the matrix."""
-    comm, gradient = system.comm, row.gradient(state)
-    R = residual(state.u, state.mu)
+@dataclass(frozen=True)
+class _Near:
+    """A state, and the matrix of one near by."""
 
-    def times(t: Direction) -> Direction:
-        return matrix.solve(_stiffness(residual, system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
+    system: System
+    matrix: Bordered
+    state: State
+    load: Vector
+    row: Row
 
-    z, directions = plus(first, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
-    for _ in range(MOST_REFINEMENTS):
-        if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-            t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
-            return t, len(directions)
-        p, q = z, times(z)
-        for before, image, square in directions:
-            part = matrix.inner(image, q) / square
-            p, q = plus(p, -part, before), plus(q, -part, image)
-        directions.append((p, q, matrix.inner(q, q)))
-        part = matrix.inner(z, q) / directions[-1][2]
-        t, z = plus(t, part, p), plus(z, -part, q)
-    return None
+    def refined(self, residual: Residual, t: Direction) -> tuple[Direction, int] | None:
+        """The tangent with some residual, from one that is nearly as good, and how often this was improved."""
+        comm, gradient = self.system.comm, self.row.gradient(self.state)
+        R = residual(self.state.u, self.state.mu)
 
+        def times(t: Direction, right: float = 0.0) -> Direction:
+            rest = self.stiffness(residual, t[0], R) + t[1] * self.load, slope(comm, gradient, t) - right
+            return self.matrix.solve(*rest, rough=self.matrix.rough)
 
-def _stiffness(residual: Residual, system: System, state: State, R: Vector, du: Vector) -> Vector:
-    """K du by a difference of the residual; R is the residual at the state."""
-    small = DIFFERENCE * system.length / (max_abs(system.comm, du) or 1.0)
-    return np.asarray((residual(state.u + small * du, state.mu) - R) / small)
+        z, directions = plus((0.0 * t[0], 0.0), -1.0, times(t, 1.0)), list[tuple[Direction, Direction, float]]()
+        for _ in range(MOST_REFINEMENTS):
+            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
+                t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
+                return t, len(directions)
+            p, q = z, times(z)
+            for before, image, square in directions:
+                part = self.matrix.inner(image, q) / square
+                p, q = plus(p, -part, before), plus(q, -part, image)
+            directions.append((p, q, self.matrix.inner(q, q)))
+            part = self.matrix.inner(z, q) / directions[-1][2]
+            t, z = plus(t, part, p), plus(z, -part, q)
+        return None
+
+    def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
+        """K du by a difference of the residual, R at the state."""
+        size = max_abs(self.system.comm, du)
+        if size == 0.0:
+            return du
+        small = DIFFERENCE * self.system.length / size
+        return np.asarray((residual(self.state.u + small * du, self.state.mu) - R) / small)

@@ -12,7 +12,18 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, largest
+from magshell_fenicsx.continuation.beside import (
+    ROUGH,
+    SMALL,
+    TOLERANCE,
+    Corrected,
+    Crossings,
+    Map,
+    Remembered,
+    Solver,
+    crossings,
+    largest,
+)
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -21,6 +32,8 @@ INDEFINITE, MISSING = 81, 92
 PATIENT = 8  # factorisations of all entries after one that the factors of the sparse part could not stand for
 CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
 REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
+CORRECTED = 1.0  # a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
+FEW = 3  # if they are not more
 ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
 Array = NDArray[np.float64]
 
@@ -145,18 +158,43 @@ class Factorisation:
         if not tangent or not remembered:  # an earlier count failed
             return False
         first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
-        counted = crossings(
-            lambda v: self._back(remembered.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
-        )
+        counted = self._crossings(remembered.times, first)
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        more, self.doubt = counted
+        self.doubt = counted.doubt
         if (changing := tangent.changing) is not None:
             of_all = largest(lambda v: self._back(changing.times(v)), first, self.comm)
             self.doubt = max(self.doubt, of_all)
-        self.negative_pivots, self.counted = self.negative_pivots + more, True
+            if self.doubt > CORRECTED and tangent.present and 0 < len(counted.large) <= FEW:
+                counted = self._corrected(tangent, changing, counted, first) or counted
+        self.negative_pivots, self.counted = self.negative_pivots + counted.more, True
         return True
+
+    def _crossings(self, D: Map, first: Vector) -> Crossings | None:
+        return crossings(lambda v: self._back(D(v)), lambda x: dot(self.comm, x, D(x)), first, self.comm)
+
+    def _corrected(self, tangent: Beside, changing: Rest, before: Crossings, first: Vector) -> Crossings | None:
+        """The count with the present second derivative along vectors of large eigenvalues; None if that fails.
+
+        What is older elsewhere makes the doubt.
+        """
+        assert tangent.present
+        X = before.large
+        lacks = [tangent.present(x) - changing.times(x) for x in X]
+        v, y = tangent.K.createVecs()
+        KX = list[Vector]()
+        for x in X:
+            v.setArray(x)
+            tangent.K.mult(v, y)
+            KX.append(np.array(y.array_r))
+        D = Corrected(tangent.D, X, lacks, KX, self.comm)
+        counted = self._crossings(D.times, first)
+        if counted is None:
+            return None
+        rest = largest(lambda v: D.apart(self._back(changing.times(D.apart(v)))), D.apart(first), self.comm)
+        self.doubt = max(SMALL / (1 - SMALL), rest)
+        return counted
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""

@@ -162,7 +162,7 @@ class BorderedNewton:
         last, count = self._linear.matrix, self.factorisation.count
         factors = self._tangents.at(state, rough=rough, sure=sure)
         kept = count == factors.count and last and last.row is row and last.state is state  # the same object
-        return last if kept and last else Bordered(self.system, factors, state, name, row)
+        return last if kept and last else Bordered(self.system, factors, state, name, row, rough=self._tangents.rough)
 
 
 @dataclass

@@ -139,8 +139,6 @@ def factored_roughly(
     """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
     if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
         return False
-    if sure and factors.knows and factors.counted and factors.doubt > DOUBT:
-        return False
     factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
     return not sure or factors.doubt <= DOUBT
 
@@ -341,9 +339,9 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
-        anew = sum(step.own for step in steps) == OLD
+        anew = sum(step.own for step in steps) == OLD and not self.foreseeing
         factors = self._tangents.at(state, self._stress, rough=not anew, sure=False)
-        matrix = Bordered(self._system, factors, state, self._name, self._row)
+        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangents.rough)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=True))
