@@ -150,11 +150,29 @@ class Crossings:
     large: list[Vector]
 
 
-class Corrected:
-    """D where it is of an earlier state, with what it lacks along some vectors, and symmetric.
+class Apart:
+    """Some vectors X and K X, and what is left of others."""
 
-    With F X = Y for k vectors X, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C with
-    C X = 1, here C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates from X.
+    def __init__(self, X: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm) -> None:
+        self._comm, self._any = comm, bool(X)
+        if X:
+            self.X, self.KX = (np.column_stack(each) for each in (X, KX))
+            self.M = comm.allreduce(self.X.T @ self.KX)
+
+    def along(self, v: Vector) -> Array:
+        """The parts of v along X, with K as the inner product. Collective."""
+        return np.asarray(np.linalg.solve(self.M, self._comm.allreduce(self.KX.T @ v)))
+
+    def of(self, v: Vector) -> Vector:
+        """What is left of v, which K separates from X. Collective."""
+        return np.asarray(v - self.X @ self.along(v)) if self._any else v
+
+
+class Corrected:
+    """D where it is of an earlier state, with what it lacks along some vectors X, and symmetric.
+
+    With F X = Y, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C with C X = 1, here
+    C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates from X.
 
     Parameters
     ----------
@@ -165,24 +183,15 @@ class Corrected:
     def __init__(
         self, D: Rest, X: Sequence[Vector], lacks: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm
     ) -> None:
-        self._D, self._comm = D, comm
-        self._X, self._Y, self._KX = (np.column_stack(each) for each in (X, lacks, KX))
-        self._M = comm.allreduce(self._X.T @ self._KX)
-        between = comm.allreduce(self._X.T @ self._Y)
+        self._D, self._comm, self._apart, self._Y = D, comm, Apart(X, KX, comm), np.column_stack(lacks)
+        between = comm.allreduce(self._apart.X.T @ self._Y)
         self._between = (between + between.T) / 2
-
-    def apart(self, v: Vector) -> Vector:
-        """What is left of a vector without X, where K separates both."""
-        return np.asarray(v - self._X @ self._along(v))
 
     def times(self, v: Vector) -> Vector:
         """(D + F) v. Collective."""
-        c, y = self._along(v), self._comm.allreduce(self._Y.T @ v)
-        back = np.linalg.solve(self._M.T, y - self._between @ c)
-        return np.asarray(self._D.times(v) + self._Y @ c + self._KX @ back)
-
-    def _along(self, v: Vector) -> Array:
-        return np.asarray(np.linalg.solve(self._M, self._comm.allreduce(self._KX.T @ v)))
+        c, y = self._apart.along(v), self._comm.allreduce(self._Y.T @ v)
+        back = np.linalg.solve(self._apart.M.T, y - self._between @ c)
+        return np.asarray(self._D.times(v) + self._Y @ c + self._apart.KX @ back)
 
 
 def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> Crossings | None:

@@ -16,6 +16,7 @@ from magshell_fenicsx.continuation.beside import (
     ROUGH,
     SMALL,
     TOLERANCE,
+    Apart,
     Corrected,
     Crossings,
     Map,
@@ -162,39 +163,43 @@ class Factorisation:
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        self.doubt = counted.doubt
-        if (changing := tangent.changing) is not None:
-            of_all = largest(lambda v: self._back(changing.times(v)), first, self.comm)
-            self.doubt = max(self.doubt, of_all)
-            if self.doubt > CORRECTED and tangent.present and 0 < len(counted.large) <= FEW:
-                counted = self._corrected(tangent, changing, counted, first) or counted
-        self.negative_pivots, self.counted = self.negative_pivots + counted.more, True
+        self.doubt, more = counted.doubt, counted.more
+        if tangent.changing is not None:
+            more = self._doubted(tangent, tangent.changing, counted, first)
+        self.negative_pivots, self.counted = self.negative_pivots + more, True
         return True
 
     def _crossings(self, D: Map, first: Vector) -> Crossings | None:
         return crossings(lambda v: self._back(D(v)), lambda x: dot(self.comm, x, D(x)), first, self.comm)
 
-    def _corrected(self, tangent: Beside, changing: Rest, before: Crossings, first: Vector) -> Crossings | None:
-        """The count with the present second derivative along vectors of large eigenvalues; None if that fails.
+    def _doubted(self, tangent: Beside, changing: Rest, counted: Crossings, first: Vector) -> int:
+        """Find the doubt of a count with what may be older; where that is large, count with what is of the present."""
+        X, large = counted.large, list[tuple[float, Vector, Vector]]()
+        KX = [self._sparse(x) for x in X]
+        for x, y in zip(X, KX, strict=True):
+            whole = dot(self.comm, x, y) + dot(self.comm, x, tangent.D.times(x))
+            large.append((abs(dot(self.comm, x, changing.times(x)) / whole), x, y))
+        apart = Apart(X, KX, self.comm)
+        rest = largest(lambda v: apart.of(self._back(changing.times(apart.of(v)))), apart.of(first), self.comm)
+        doubted = [(x, y) for doubt, x, y in large if doubt > CORRECTED]
+        self.doubt = max([rest, SMALL / (1 - SMALL), *(doubt for doubt, _, _ in large)])
+        if not (tangent.present and rest <= CORRECTED and 0 < len(doubted) <= FEW):
+            return counted.more
+        X, KX = ([each[i] for each in doubted] for i in range(2))
+        D = Corrected(tangent.D, X, [tangent.present(x) - changing.times(x) for x in X], KX, self.comm)
+        again = self._crossings(D.times, first)
+        if again is None:
+            return counted.more
+        self.doubt = max([rest, SMALL / (1 - SMALL), *(doubt for doubt, _, _ in large if doubt <= CORRECTED)])
+        return again.more
 
-        What is older elsewhere makes the doubt.
-        """
-        assert tangent.present
-        X = before.large
-        lacks = [tangent.present(x) - changing.times(x) for x in X]
-        v, y = tangent.K.createVecs()
-        KX = list[Vector]()
-        for x in X:
-            v.setArray(x)
-            tangent.K.mult(v, y)
-            KX.append(np.array(y.array_r))
-        D = Corrected(tangent.D, X, lacks, KX, self.comm)
-        counted = self._crossings(D.times, first)
-        if counted is None:
-            return None
-        rest = largest(lambda v: D.apart(self._back(changing.times(D.apart(v)))), D.apart(first), self.comm)
-        self.doubt = max(SMALL / (1 - SMALL), rest)
-        return counted
+    def _sparse(self, x: Vector) -> Vector:
+        """K x."""
+        assert self._rhs is not None
+        v, y = self._rhs.duplicate(), self._rhs.duplicate()
+        v.setArray(x)
+        self.matrix.mult(v, y)
+        return np.array(y.array_r)
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""

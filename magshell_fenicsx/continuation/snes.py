@@ -27,6 +27,7 @@ DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an ear
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
+CERTAIN = 0.1  # ratio of two such steps, and part of the tolerance, for which the error is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
@@ -232,6 +233,7 @@ class Linearised:
     ) -> None:
         """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`."""
         self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
+        self._computed = list[float]()  # steps with computed forces
         self._tolerance = tolerance
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
@@ -298,14 +300,25 @@ class Linearised:
         self._at, self._state = x.stateGet(), state
         self._ahead = self._next_step(state, self.split(f))
         size = self.error
-        if self._foreseen and not size > max(self._least(state), FORESEEN * self._ventured):
+        if self._foreseen and not size > self._foreseeable(state):
             self._foreseen = False
             self._compute(state, f)
             self._ahead, size = self._again(self.split(f)), self.error
+            self._computed.append(size)
             self._ventured = size
         self._ventured = max(self._ventured, size)
         self._handle, self._residual = f.handle, f.stateGet()
         return state
+
+    def _foreseeable(self, state: State) -> float:
+        """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not.
+
+        The error after a step with computed forces is that step times their ratio (Deuflhard, sec. 2.1.4).
+        """
+        least, steps = self._least(state), self._computed
+        if len(steps) > 1 and steps[-1] <= CERTAIN * steps[-2] and steps[-1] ** 2 <= CERTAIN * least * steps[-2]:
+            return -1.0
+        return max(least, FORESEEN ** (1 + len(steps) / 2) * self._ventured)
 
     def _again(self, f: Direction) -> Direction:
         """The next step by the same matrix, in place of one with foreseen forces."""

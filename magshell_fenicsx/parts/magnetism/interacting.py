@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-CHANGES = 6  # latest ones that are remembered
-OWN = 0.1  # of a change: what newer ones do not have, at least
+CHANGES = 4  # latest ones that are remembered
+OWN = 0.3  # of a change: what newer ones do not have, at least
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
