@@ -147,14 +147,16 @@ class WholeMatrix:
         """A sparse matrix, to which its own entries of terms times factors are added, and the rest. Collective."""
         starts, columns, values = K.getValuesCSR()
         whole = [self.of_term(factor, term, rough=rough) for factor, term in terms]
-        kept = [replace(part, left_out=self._in(starts, columns, part)) for part in whole]
-        for part in kept:
-            values += part.factor * part.left_out.data
+        kept = list[OfTerm]()
+        for part in whole:
+            left_out = self._in(starts, columns, part)
+            values += part.factor * left_out.data
+            kept.append(replace(part, left_out=left_out))
         K.setValuesCSR(starts, columns, values)
         K.assemble()
         return Beside(K, Rows(self, kept), Rows(self, whole))
 
-    def _in(self, starts: NDArray[np.int32], columns: NDArray[np.int32], part: OfTerm) -> csr_array:
+    def _in(self, starts: NDArray[np.intp], columns: NDArray[np.intp], part: OfTerm) -> csr_array:
         """What a sparse matrix has entries for, of a term without its factor; found once, as patterns do not change."""
         found = self._found
         if found is None or found[0] is not part.stored or len(found[1].data) != len(columns):

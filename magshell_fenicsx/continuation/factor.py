@@ -12,19 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import (
-    ROUGH,
-    SMALL,
-    TOLERANCE,
-    Apart,
-    Corrected,
-    Crossings,
-    Map,
-    Remembered,
-    Solver,
-    crossings,
-    largest,
-)
+from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, doubted
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -33,8 +21,6 @@ INDEFINITE, MISSING = 81, 92
 PATIENT = 8  # factorisations of all entries after one that the factors of the sparse part could not stand for
 CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
 REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
-CORRECTED = 1.0  # a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
-FEW = 3  # if they are not more
 ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
 Array = NDArray[np.float64]
 
@@ -159,47 +145,14 @@ class Factorisation:
         if not tangent or not remembered:  # an earlier count failed
             return False
         first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
-        counted = self._crossings(remembered.times, first)
+        counted = crossings(remembered.times, self._back, first, self.comm)
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        self.doubt, more = counted.doubt, counted.more
-        if tangent.changing is not None:
-            more = self._doubted(tangent, tangent.changing, counted, first)
-        self.negative_pivots, self.counted = self.negative_pivots + more, True
+        counted = doubted(tangent, counted, self._back, self._sparse, first, self.comm)
+        self.doubt, self.counted = counted.doubt, True
+        self.negative_pivots += counted.more
         return True
-
-    def _crossings(self, D: Map, first: Vector) -> Crossings | None:
-        return crossings(lambda v: self._back(D(v)), lambda x: dot(self.comm, x, D(x)), first, self.comm)
-
-    def _doubted(self, tangent: Beside, changing: Rest, counted: Crossings, first: Vector) -> int:
-        """Find the doubt of a count with what may be older; where that is large, count with what is of the present."""
-        X, large = counted.large, list[tuple[float, Vector, Vector]]()
-        KX = [self._sparse(x) for x in X]
-        for x, y in zip(X, KX, strict=True):
-            whole = dot(self.comm, x, y) + dot(self.comm, x, tangent.D.times(x))
-            large.append((abs(dot(self.comm, x, changing.times(x)) / whole), x, y))
-        apart = Apart(X, KX, self.comm)
-        rest = largest(lambda v: apart.of(self._back(changing.times(apart.of(v)))), apart.of(first), self.comm)
-        doubted = [(x, y) for doubt, x, y in large if doubt > CORRECTED]
-        self.doubt = max([rest, SMALL / (1 - SMALL), *(doubt for doubt, _, _ in large)])
-        if not (tangent.present and rest <= CORRECTED and 0 < len(doubted) <= FEW):
-            return counted.more
-        X, KX = ([each[i] for each in doubted] for i in range(2))
-        D = Corrected(tangent.D, X, [tangent.present(x) - changing.times(x) for x in X], KX, self.comm)
-        again = self._crossings(D.times, first)
-        if again is None:
-            return counted.more
-        self.doubt = max([rest, SMALL / (1 - SMALL), *(doubt for doubt, _, _ in large if doubt <= CORRECTED)])
-        return again.more
-
-    def _sparse(self, x: Vector) -> Vector:
-        """K x."""
-        assert self._rhs is not None
-        v, y = self._rhs.duplicate(), self._rhs.duplicate()
-        v.setArray(x)
-        self.matrix.mult(v, y)
-        return np.array(y.array_r)
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""
@@ -277,10 +230,13 @@ class Factorisation:
         return Edge(self._edged, self.comm, solve, times).solve(rhs) if self._edged else solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
+        return self._sparse(x) + (self._rest.times(x) if self._rest else 0.0)
+
+    def _sparse(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
-        return np.array(y.array_r) + (self._rest.times(x) if self._rest else 0.0)
+        return np.array(y.array_r)
 
     def _inner(self, rhs: Vector, *, rough: bool = False) -> Vector:
         """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""

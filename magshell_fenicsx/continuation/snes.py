@@ -318,7 +318,7 @@ class Linearised:
         least, steps = self._least(state), self._computed
         if len(steps) > 1 and steps[-1] <= CERTAIN * steps[-2] and steps[-1] ** 2 <= CERTAIN * least * steps[-2]:
             return -1.0
-        return max(least, FORESEEN ** (1 + len(steps) / 2) * self._ventured)
+        return max(least, float(FORESEEN ** (1 + len(steps) / 2)) * self._ventured)
 
     def _again(self, f: Direction) -> Direction:
         """The next step by the same matrix, in place of one with foreseen forces."""

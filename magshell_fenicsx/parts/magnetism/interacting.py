@@ -84,7 +84,7 @@ class Foreseen:
                         s, y = s - part * q, y - part * of_q
                 rest = float(np.linalg.norm(s))
                 if rest > OWN * size:
-                    self._basis.append((s / rest, y / rest))
+                    self._basis.append((np.asarray(s / rest), np.asarray(y / rest)))
         return self._basis
 
 
