@@ -87,15 +87,15 @@ class Evaluated:
         """A vector at all nodes of this rank, ghosts too, summed over all ranks; zero at supports."""
         return self._system._summed(part)
 
-    def residual(self) -> Vector:
-        """dPi/du, and u itself along directions in which nodes on oblique planes are held.
+    def residual(self, *, rough: bool = False) -> Vector:
+        """dPi/du, and u itself along directions in which nodes on oblique planes are held; `rough` as in `Roughly`.
 
         The terms that are not numbers are noted in the system's `strange`.
         """
         system = self._present
         factors = system._factors(self._mu)
         if system.noise is None:
-            whole = system._summed(system._gradient(factors))
+            whole = system._summed(system._gradient(factors, rough=rough))
             if not system._finite(whole.sum()):
                 system.strange = self._not_numbers(factors)
         else:

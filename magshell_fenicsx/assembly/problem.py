@@ -5,8 +5,9 @@ has from its history stands in it, and goes on by `FiniteElementSystem.advance` 
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -23,11 +24,15 @@ from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
+from magshell_fenicsx.assembly.whole import WholeTerm
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, State, Vector, Weighted, symmetric_part
 from magshell_fenicsx.platform import compat
 
 Setting: TypeAlias = tuple[Settable, float]  # a number of the terms, and its value in a state that has none
+
+
+DIFFERENCE = 1e-5  # of the length: the step of differences of forces
 
 
 class FiniteElementSystem:
@@ -150,8 +155,9 @@ class FiniteElementSystem:
             self.moving.put(whole, mu)
         return whole
 
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return Evaluated(self, u, mu).residual()
+    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
+        """See `System` and `Roughly`."""
+        return Evaluated(self, u, mu).residual(rough=rough)
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """See `Evaluated.forces`."""
@@ -305,12 +311,29 @@ class FiniteElementSystem:
         N = self._skew(factors)
         if self.of_all:
             K = self.of_all.beside(K, factors, rough=rough)
+            if isinstance(K, Beside) and rough:
+                K = replace(K, present=self._present_of_all({t.name: factors[t.name] for t in self.of_all.terms}))
             K = symmetric_part(K) if N or self.projection or self.noise else K
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
         return Skewed(K, N) if N else K
+
+    def _present_of_all(self, factors: Mapping[str, float]) -> Callable[[Vector], Vector]:
+        """The tangent of some terms, at the displacement that is set now, times a vector: by differences of forces."""
+        u = np.array(self.u.x.array)
+
+        def times(v: Vector) -> Vector:
+            step, along = self.step_along(v, DIFFERENCE), self.with_ghosts(v)
+            before, product = np.array(self.u.x.array), np.zeros(self.size)
+            for way in (1.0, -1.0):
+                self.u.x.array[:] = u + way * step * along
+                product += way / (2 * step) * self._summed(self._gradient(factors))
+            self.u.x.array[:] = before
+            return product
+
+        return times
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""
@@ -338,16 +361,21 @@ class FiniteElementSystem:
         return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = ()
+        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = (), *, rough: bool = False
     ) -> NDArray[np.float64]:
-        """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
+        """This rank's part of the gradient of the terms with these factors, by name, plus further terms.
+
+        If `rough`, those in which all unknowns act on each other may be foreseen.
+        """
         with self.assembly:
             b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
             if self.gradients and factors:
                 self.gradients.add(b, factors)
             own = [(factors.get(t.name, 0.0), t) for t in self._own_residual]
             for factor, term in itertools.chain(own, besides):
-                if factor:
+                if factor and rough and isinstance(term, WholeTerm):
+                    term.add_foreseen(b, factor)
+                elif factor:
                     term.add_residual(b, factor)
             return b
 

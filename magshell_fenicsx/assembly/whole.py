@@ -48,6 +48,9 @@ class WholeTerm(Term, Protocol):
     def acting(self, *, rough: bool = False) -> Acting:
         """d2Pi/du2; if `rough`, it may be that of an earlier state. Collective."""
 
+    def add_foreseen(self, b: Array, factor: float) -> None:
+        """As `add_residual`, by what is known of states near by; collective."""
+
 
 @dataclass(frozen=True)
 class OfTerm:
@@ -120,6 +123,7 @@ class WholeMatrix:
         self.comm, self.held = comm, (held, np.concatenate(comm.allgather(held)))
         self._whole: tuple[Array, Array, PETSc.Mat] | None = None
         self._stored: dict[str, tuple[Acting, bsr_array]] = {}
+        self._found: tuple[bsr_array, csr_array] | None = None
 
     def _made(self) -> tuple[Array, Array, PETSc.Mat]:
         """The entries in columns of own nodes and in others, which the third, their matrix, shares."""
@@ -142,16 +146,26 @@ class WholeMatrix:
     def beside(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]], *, rough: bool = False) -> Beside:
         """A sparse matrix, to which its own entries of terms times factors are added, and the rest. Collective."""
         starts, columns, values = K.getValuesCSR()
-        rows, kept = np.repeat(np.arange(len(starts) - 1), np.diff(starts)), list[OfTerm]()
-        free = ~(self.held[0][rows] | self.held[1][columns])
         whole = [self.of_term(factor, term, rough=rough) for factor, term in terms]
+        kept = list[OfTerm]()
         for part in whole:
-            given = np.where(free, _entries(part.stored, rows, columns), 0.0)
-            values += part.factor * given
-            kept.append(replace(part, left_out=csr_array((given, columns, starts), part.stored.shape)))
+            left_out = self._in(starts, columns, part)
+            values += part.factor * left_out.data
+            kept.append(replace(part, left_out=left_out))
         K.setValuesCSR(starts, columns, values)
         K.assemble()
         return Beside(K, Rows(self, kept), Rows(self, whole))
+
+    def _in(self, starts: NDArray[np.intp], columns: NDArray[np.intp], part: OfTerm) -> csr_array:
+        """What a sparse matrix has entries for, of a term without its factor; found once, as patterns do not change."""
+        found = self._found
+        if found is None or found[0] is not part.stored or len(found[1].data) != len(columns):
+            rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+            free = ~(self.held[0][rows] | self.held[1][columns])
+            given = np.where(free, _entries(part.stored, rows, columns), 0.0)
+            found = part.stored, csr_array((given, columns, starts), part.stored.shape)
+            self._found = found
+        return found[1]
 
     def sum(self, K: PETSc.Mat, parts: Sequence[OfTerm]) -> PETSc.Mat:
         """A sparse matrix plus terms times factors. Collective."""

@@ -5,25 +5,27 @@ an eigenvalue nu < -1 of A makes it singular once, at t = -1/nu, with the vector
 where x . D x < 0, else one less. So the inertia of K is that of K0 and what the few eigenvalues of A below -1 add.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import Rest, Vector, dot
+from magshell_fenicsx.continuation.system import Beside, Rest, Vector, dot
 
 SMALL = 0.1  # eigenvalues of A within this size are not looked at one by one
 LEAST, MOST = 4, 30  # products with A for them: as many as show that there are none beyond, and before it is given up
 RUNS = 6  # with what was found before left out: eigenvalues may be multiple
 SURE = 0.1  # error of an eigenvalue over its distance from -1
 TOLERANCE, ACCEPTED = 1e-12, 1e-7  # of a solution's rest, over the first one; the second where rounding hides more
-ROUGH = 3e-3  # the first of these of a step of Newton's method
+ROUGH = 3e-2  # the first of these of a step of Newton's method
+CORRECTED = 1.0  # a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
+FEW = 3  # if they are not more
 KEPT = 40  # products with D that are remembered
 DEPENDENT = 1e-12  # square of the part of a vector that others do not have
 Array = NDArray[np.float64]
 Map = Callable[[Vector], Vector]
-Energy = Callable[[Vector], float]
 
 
 class Krylov:
@@ -132,17 +134,74 @@ class Solver:
         return u, c
 
 
-def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tuple[int, float] | None:
-    """How many more negative eigenvalues K0 + D has than K0, and the doubt; None if A has too many large ones.
+@dataclass(frozen=True)
+class Crossings:
+    """How many more negative eigenvalues K0 + D has than K0.
 
-    The doubt is the largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is the same.
+    Attributes
+    ----------
+    doubt
+        The largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is the same.
+    large
+        Vectors of the eigenvalues beyond `SMALL`.
+    """
+
+    more: int
+    doubt: float
+    large: list[Vector]
+
+
+class Apart:
+    """Some vectors X and K X, and what is left of others."""
+
+    def __init__(self, X: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm) -> None:
+        self._comm, self._any = comm, bool(X)
+        if X:
+            self.X, self.KX = (np.column_stack(each) for each in (X, KX))
+            self.M = comm.allreduce(self.X.T @ self.KX)
+
+    def along(self, v: Vector) -> Array:
+        """The parts of v along X, with K as the inner product. Collective."""
+        return np.asarray(np.linalg.solve(self.M, self._comm.allreduce(self.KX.T @ v)))
+
+    def of(self, v: Vector) -> Vector:
+        """What is left of v, which K separates from X. Collective."""
+        return np.asarray(v - self.X @ self.along(v)) if self._any else v
+
+
+class Corrected:
+    """D where it is of an earlier state, with what it lacks along some vectors X, and symmetric.
+
+    With F X = Y, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C with C X = 1, here
+    C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates from X.
 
     Parameters
     ----------
-    times
-        A times a vector.
-    energy
-        x . D x
+    lacks
+        Y.
+    """
+
+    def __init__(
+        self, D: Rest, X: Sequence[Vector], lacks: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm
+    ) -> None:
+        self._D, self._comm, self._apart, self._Y = D, comm, Apart(X, KX, comm), np.column_stack(lacks)
+        between = comm.allreduce(self._apart.X.T @ self._Y)
+        self._between = (between + between.T) / 2
+
+    def times(self, v: Vector) -> Vector:
+        """(D + F) v. Collective."""
+        c, y = self._apart.along(v), self._comm.allreduce(self._Y.T @ v)
+        back = np.linalg.solve(self._apart.M.T, y - self._between @ c)
+        return np.asarray(self._D.times(v) + self._Y @ c + self._apart.KX @ back)
+
+
+def crossings(D: Map, back: Map, first: Vector, comm: MPI.Comm) -> Crossings | None:
+    """How many more negative eigenvalues K0 + D has than K0; None if A has too many large ones.
+
+    Parameters
+    ----------
+    D, back
+        D and K^-1 times a vector.
     first
         Begins the iteration.
     """
@@ -154,7 +213,7 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
         return v
 
     for _ in range(RUNS):
-        krylov, size = Krylov(lambda v: apart(times(v)), apart(first), comm, MOST), 0
+        krylov, size = Krylov(lambda v: apart(back(D(v))), apart(first), comm, MOST), 0
         while True:
             size = krylov.grow()
             values, vectors = np.linalg.eig(krylov.H[:size, :size])
@@ -166,16 +225,43 @@ def crossings(times: Map, energy: Energy, first: Vector, comm: MPI.Comm) -> tupl
                 return None
         doubt = max(doubt, float((np.abs(values) / np.abs(1 + values)).max()))
         if not len(far):
-            return more, doubt
+            return Crossings(more, doubt, out)
         for i in far[values[far].imag >= 0]:  # of a conjugate pair one
             parts = [vectors[:, i].real, vectors[:, i].imag] if values[i].imag > 0 else [vectors[:, i].real]
             vectors_of_value = [krylov.combined(part) for part in parts]
             if values[i].imag == 0 and values[i].real < -1:
-                more += 1 if energy(vectors_of_value[0]) < 0 else -1
+                x = vectors_of_value[0]
+                more += 1 if dot(comm, x, D(x)) < 0 else -1
             for x in vectors_of_value:
                 x = apart(x)
                 out.append(x / np.sqrt(dot(comm, x, x)))
     return None
+
+
+def doubted(tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vector, comm: MPI.Comm) -> Crossings:
+    """A count with the doubt that what may be of an earlier state makes; a large one is met with what is present.
+
+    What is older, with an error as large as itself, changes the sign along a vector x where x . changing x is larger
+    than x . (K + D) x. Of vectors that K separates from those of large eigenvalues, only the largest is looked at.
+    """
+    changing = tangent.changing
+    if changing is None:
+        return counted
+    X, least = counted.large, SMALL / (1 - SMALL)
+    KX = [K(x) for x in X]
+    doubts = [
+        abs(dot(comm, x, changing.times(x)) / (dot(comm, x, y) + dot(comm, x, tangent.D.times(x))))
+        for x, y in zip(X, KX, strict=True)
+    ]
+    apart = Apart(X, KX, comm)
+    rest = max(least, largest(lambda v: apart.of(back(changing.times(apart.of(v)))), apart.of(first), comm))
+    large = [i for i, doubt in enumerate(doubts) if not doubt <= CORRECTED]
+    if tangent.present and rest <= CORRECTED and 0 < len(large) <= FEW:
+        X, KX = ([each[i] for i in large] for each in (X, KX))
+        D = Corrected(tangent.D, X, [tangent.present(x) - changing.times(x) for x in X], KX, comm)
+        if again := crossings(D.times, back, first, comm):
+            return replace(again, doubt=max([rest, *(doubt for doubt in doubts if doubt <= CORRECTED)]))
+    return replace(counted, doubt=max([rest, *doubts]))
 
 
 def largest(times: Map, first: Vector, comm: MPI.Comm) -> float:

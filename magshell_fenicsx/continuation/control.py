@@ -5,7 +5,7 @@ The bordered matrix is inverted by block elimination; Broyden's update goes on w
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from math import sqrt
 from typing import Generic, Protocol, TypeVar
@@ -14,7 +14,16 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    Direction,
+    Roughly,
+    State,
+    System,
+    Vector,
+    dot,
+    max_abs,
+)
 
 MOST_REFINEMENTS = 4
 REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
@@ -23,6 +32,7 @@ COARSE = 1e-4  # beside a tangent: a correction that such differences give well
 LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
 
 V = TypeVar("V")
+Residual = Callable[[Vector, Amplitudes], Vector]
 
 
 class Row(Protocol):
@@ -142,14 +152,18 @@ class Bordered:
     ----------
     column
         R_mu.
+    rough
+        Whether a small part of K is that of an earlier state, so that its solutions need not be better.
     """
 
-    def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
-        self.state, self.row, self._mu = state, row, state.mu[name]
+    def __init__(
+        self, system: System, factors: Factorisation, state: State, name: str, row: Row, *, rough: bool = False
+    ) -> None:
+        self.state, self.row, self.rough, self._mu = state, row, rough, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        self._x2 = factors.solve(self.column)
+        self._x2 = factors.solve(self.column, rough=rough)
         self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
         self._weight = dot(self._comm, self._x2, self._x2)  # dmu counts as the displacement that it causes
 
@@ -229,36 +243,64 @@ class Chord(Generic[V]):
 
 
 def refined_tangent(
-    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row
+    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row, *, foreseeing: bool = False
 ) -> Direction | None:
     """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
 
-    None if the matrix is too far away.
+    If `foreseeing`, with forces that are foreseen, and computed along the tangent itself. None if the matrix is too far
+    away.
     """
-    comm, gradient = system.comm, row.gradient(state)
-    R = system.residual(state.u, state.mu)
-
-    def times(t: Direction) -> Direction:
-        return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
-
-    z, directions = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
-    for _ in range(MOST_REFINEMENTS):
-        if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-            return plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
-        p, q = z, times(z)
-        for before, image, square in directions:
-            part = matrix.inner(image, q) / square
-            p, q = plus(p, -part, before), plus(q, -part, image)
-        directions.append((p, q, matrix.inner(q, q)))
-        part = matrix.inner(z, q) / directions[-1][2]
-        t, z = plus(t, part, p), plus(z, -part, q)
+    near = _Near(system, matrix, state, load, row)
+    if not foreseeing:
+        refined = near.refined(system.residual, t)
+        return refined[0] if refined else None
+    assert isinstance(system, Roughly)
+    for known in range(MOST_REFINEMENTS):
+        refined = near.refined(partial(system.residual, rough=True), t)
+        if refined is None or (known and refined[1] == 0):
+            return refined[0] if refined else None
+        t = refined[0]
+        near.stiffness(system.residual, t[0], t[0])  # what is foreseen from now on is right along t
     return None
 
 
-def _stiffness(system: System, state: State, R: Vector, du: Vector) -> Vector:
-    """K du by a difference of the residual; R is the residual at the state."""
-    size = max_abs(system.comm, du)
-    if size == 0.0:
-        return du
-    small = DIFFERENCE * system.length / size
-    return np.asarray((system.residual(state.u + small * du, state.mu) - R) / small)
+@dataclass(frozen=True)
+class _Near:
+    """A state, and the matrix of one near by."""
+
+    system: System
+    matrix: Bordered
+    state: State
+    load: Vector
+    row: Row
+
+    def refined(self, residual: Residual, t: Direction) -> tuple[Direction, int] | None:
+        """The tangent with some residual, from one that is nearly as good, and how often this was improved."""
+        comm, gradient = self.system.comm, self.row.gradient(self.state)
+        R = residual(self.state.u, self.state.mu)
+
+        def times(t: Direction, right: float = 0.0) -> Direction:
+            rest = self.stiffness(residual, t[0], R) + t[1] * self.load, slope(comm, gradient, t) - right
+            return self.matrix.solve(*rest, rough=self.matrix.rough)
+
+        z, directions = plus((0.0 * t[0], 0.0), -1.0, times(t, 1.0)), list[tuple[Direction, Direction, float]]()
+        for _ in range(MOST_REFINEMENTS):
+            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
+                t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
+                return t, len(directions)
+            p, q = z, times(z)
+            for before, image, square in directions:
+                part = self.matrix.inner(image, q) / square
+                p, q = plus(p, -part, before), plus(q, -part, image)
+            directions.append((p, q, self.matrix.inner(q, q)))
+            part = self.matrix.inner(z, q) / directions[-1][2]
+            t, z = plus(t, part, p), plus(z, -part, q)
+        return None
+
+    def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
+        """K du by a difference of the residual, R at the state."""
+        size = max_abs(self.system.comm, du)
+        if size == 0.0:
+            return du
+        small = DIFFERENCE * self.system.length / size
+        return np.asarray((residual(self.state.u + small * du, self.state.mu) - R) / small)

@@ -12,7 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, largest
+from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, doubted
 from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
@@ -145,17 +145,13 @@ class Factorisation:
         if not tangent or not remembered:  # an earlier count failed
             return False
         first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
-        counted = crossings(
-            lambda v: self._back(remembered.times(v)), lambda x: dot(self.comm, x, tangent.D.times(x)), first, self.comm
-        )
+        counted = crossings(remembered.times, self._back, first, self.comm)
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None
             return False
-        more, self.doubt = counted
-        if (changing := tangent.changing) is not None:
-            of_all = largest(lambda v: self._back(changing.times(v)), first, self.comm)
-            self.doubt = max(self.doubt, of_all)
-        self.negative_pivots, self.counted = self.negative_pivots + more, True
+        counted = doubted(tangent, counted, self._back, self._sparse, first, self.comm)
+        self.doubt, self.counted = counted.doubt, True
+        self.negative_pivots += counted.more
         return True
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
@@ -234,10 +230,13 @@ class Factorisation:
         return Edge(self._edged, self.comm, solve, times).solve(rhs) if self._edged else solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
+        return self._sparse(x) + (self._rest.times(x) if self._rest else 0.0)
+
+    def _sparse(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
-        return np.array(y.array_r) + (self._rest.times(x) if self._rest else 0.0)
+        return np.array(y.array_r)
 
     def _inner(self, rhs: Vector, *, rough: bool = False) -> Vector:
         """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""

@@ -109,7 +109,9 @@ class BorderedNewton:
         most
             A longer step, in lengths, ends the solve early, and so do steps that lead astray: see `Iterates.hasty`.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress, near, most)
+        outcome = self._solved(self._snes, guess, name, row, stress, near, most, foreseeing=self._tangents.foresees)
+        if not outcome.converged and self._linear.foreseeing:
+            outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
@@ -124,9 +126,12 @@ class BorderedNewton:
         stress: Sequence[Weighted],
         near: float = 0.0,
         most: float = np.inf,
+        *,
+        foreseeing: bool = False,
     ) -> Outcome:
-        linear, searched = self._linear, snes is self._searching
-        linear.begin(guess, name, row, stress, snes.getTolerances()[2], searched=searched, near=near, most=most)
+        linear, searched, at_most = self._linear, snes is self._searching, snes.getTolerances()[2]
+        of = guess, name, row, stress, at_most
+        linear.begin(*of, searched=searched, near=near, most=most, foreseeing=foreseeing)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()
@@ -184,7 +189,9 @@ class BorderedNewton:
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         if (moved and fresh) or self._tangents.rough:
-            refined = refined_tangent(self.system, matrix, tangent, state, load, row)
+            refined = refined_tangent(
+                self.system, matrix, tangent, state, load, row, foreseeing=self._tangents.foresees
+            )
             if refined is None:
                 return self.response(state, name, row, anew=True)
             tangent = refined
@@ -197,7 +204,7 @@ class BorderedNewton:
         last, count = self._linear.matrix, self.factorisation.count
         factors = self._tangents.at(state, rough=rough, sure=sure)
         kept = count == factors.count and last and last.row is row and last.state is state  # the same object
-        return last if kept and last else Bordered(self.system, factors, state, name, row)
+        return last if kept and last else Bordered(self.system, factors, state, name, row, rough=self._tangents.rough)
 
 
 @dataclass

@@ -6,9 +6,9 @@ Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4, QNERR). The re
 the stiff part of a structure hides errors of its soft part.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -16,25 +16,20 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
 from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat
 
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
-FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
-SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
-GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
-STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
-SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
-ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
+FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
+CERTAIN = 0.1  # ratio of two such steps, and part of the tolerance, for which the error is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 FAR = "the first guess is too far away"
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
-Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 Reason = PETSc.SNES.ConvergedReason
 REASON_OF: dict[Verdict, Any] = {
     "go on": Reason.CONVERGED_ITERATING,
@@ -136,6 +131,11 @@ class Tangents:
         return factors
 
     @property
+    def foresees(self) -> bool:
+        """Whether a part of the forces may be foreseen from states before: it is small, and was so far."""
+        return isinstance(self.system, Roughly) and self.system.dear and self._factorisation.knows
+
+    @property
     def certain(self) -> bool:
         """Whether the number of unstable directions is known, of the latest factors, in spite of an older part."""
         factors = self._factorisation
@@ -149,102 +149,8 @@ def factored_roughly(
     """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
     if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
         return False
-    if sure and factors.knows and factors.counted and factors.doubt > DOUBT:
-        return False
     factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
     return not sure or factors.doubt <= DOUBT
-
-
-@dataclass(frozen=True)
-class Step:
-    """The next step at an iterate.
-
-    Attributes
-    ----------
-    size
-        Size of the step, see `Bordered.size`.
-    own
-        Whether the matrix was computed at this iterate.
-    pivots
-        Its negative ones.
-    """
-
-    size: float
-    own: bool
-    pivots: int = 0
-
-
-@dataclass
-class Iterates:
-    """The steps of one solve, in lengths of the system, from which alone its convergence is judged.
-
-    Parameters
-    ----------
-    largest
-        A longer step counts as divergence.
-    patience
-        Matrices after which steps must have shrunk.
-    searched
-        Whether a line search shortens them: then they may grow.
-    kinks
-        Whether steps may shrink suddenly less: then none is foreseen.
-    hasty
-        Whether the solve is given up early where a shorter step of the path costs less.
-    """
-
-    largest: float = np.inf
-    patience: int = 4
-    searched: bool = False
-    kinks: bool = False
-    hasty: bool = False
-    steps: list[Step] = field(default_factory=list)
-
-    @property
-    def foreseen(self) -> float:
-        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
-        if self.kinks or self.searched or len(self.steps) < 2:
-            return np.inf
-        rate = self.steps[-1].size / self.steps[-2].size
-        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
-
-    @property
-    def error(self) -> float:
-        """The estimated error after the last step."""
-        return min(self.steps[-1].size, self.foreseen) if self.steps else np.inf
-
-    def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
-        """The verdict on the iterate, from the last step.
-
-        Parameters
-        ----------
-        tolerance
-            Of the iterate's error.
-        rounding
-            Computes the error from rounding of the residual.
-        """
-        step, before = self.steps[-1], self.steps[:-1]
-        if not step.size <= self.largest:
-            return "far" if self.hasty else "diverged"
-        if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
-            return "converged"
-        own = [s for s in before if s.own]
-        full = [s.size for s in own]
-        if self.hasty and step.own and self._astray(own, step):
-            return "far"
-        stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
-        if stalled and step.size <= ROUNDING * rounding():
-            return "rounding"
-        if step.own and len(before) > 2 and full and step.size > 2 * full[-1] and not self.searched:
-            return "diverged"
-        if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
-            return "diverged"
-        return "go on"
-
-    def _astray(self, before: Sequence[Step], step: Step) -> bool:
-        """Whether steps with matrices of their own lead away, past an instability, or stay long."""
-        if len(before) == 1:
-            return step.size > FULL * before[0].size and step.pivots != before[0].pivots
-        return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
 
 
 class Linearised:
@@ -273,13 +179,16 @@ class Linearised:
         searched: bool = False,
         near: float = 0.0,
         most: float = np.inf,
+        foreseeing: bool = False,
     ) -> None:
-        """Begin a solve, with a line search or without; as `BorderedNewton.solve`."""
+        """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`."""
+        self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
+        self._computed = list[float]()  # steps with computed forces
         self._tolerance, self._near = tolerance, near
         self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
         patience = SEARCHED if searched else self._options.patience
         o = self._options
-        kinks = o.kinks or bool(self._system.coordinates)  # the force of a body is stiff
+        kinks = o.kinks or foreseeing or bool(self._system.coordinates)  # the force of a body is stiff
         self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, hasty=most < np.inf)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
@@ -295,8 +204,16 @@ class Linearised:
 
     def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """R and g."""
-        state = self._state_of(x)
-        self.join((self._system.residual(state.u, state.mu), self._row.residual(state)), f)
+        self._foreseen = self.foreseeing
+        self._compute(self._state_of(x), f)
+
+    def _compute(self, state: State, f: PETSc.Vec) -> None:
+        if self._foreseen:
+            assert isinstance(self._system, Roughly)
+            R = self._system.residual(state.u, state.mu, rough=True)
+        else:
+            R = self._system.residual(state.u, state.mu)
+        self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
         """The matrix for an iterate: that of an earlier one while the steps shrink."""
@@ -319,9 +236,11 @@ class Linearised:
         """Whether the next step is small enough, or will never be."""
         x, f = snes.getSolution(), snes.getFunction()[0]
         state = self._linearise(x, f)
-        length = self._system.length
-        scale = max(1.0, MOTION * max_abs(self._system.comm, state.u) / length)
-        return REASON_OF[self._iterates.judge(self._tolerance * scale, lambda: self._rounding(state, f))]
+        return REASON_OF[self._iterates.judge(self._least(state), lambda: self._rounding(state, f))]
+
+    def _least(self, state: State) -> float:
+        """The size of a step that counts as converged."""
+        return self._tolerance * max(1.0, MOTION * max_abs(self._system.comm, state.u) / self._system.length)
 
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
         """Choose the matrix for an iterate, and compute its next step; once for each iterate."""
@@ -331,9 +250,36 @@ class Linearised:
         if before is not None:
             self._go_on(before, state)
         self._at, self._state = x.stateGet(), state
-        self._handle, self._residual = f.handle, f.stateGet()
         self._ahead = self._next_step(state, self.split(f))
+        size = self._iterates.steps[-1].size
+        if self._foreseen and not size > self._foreseeable(state):
+            self._foreseen = False
+            self._compute(state, f)
+            self._ahead = self._again(self.split(f))
+            size = self._iterates.steps[-1].size
+            self._computed.append(size)
+            self._ventured = size
+        self._ventured = max(self._ventured, size)
+        self._handle, self._residual = f.handle, f.stateGet()
         return state
+
+    def _foreseeable(self, state: State) -> float:
+        """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not.
+
+        The error after a step with computed forces is that step times their ratio (Deuflhard, sec. 2.1.4).
+        """
+        least, steps = self._least(state), self._computed
+        if len(steps) > 1 and steps[-1] <= CERTAIN * steps[-2] and steps[-1] ** 2 <= CERTAIN * least * steps[-2]:
+            return -1.0
+        return max(least, float(FORESEEN ** (1 + len(steps) / 2)) * self._ventured)
+
+    def _again(self, f: Direction) -> Direction:
+        """The next step by the same matrix, in place of one with foreseen forces."""
+        assert self.matrix
+        assert self._chord
+        step = self._chord.step(f)
+        self._iterates.steps[-1] = replace(self._iterates.steps[-1], size=self.matrix.size(step))
+        return step
 
     def _go_on(self, before: State, state: State) -> None:
         """The iterate has moved, by the whole step unless a line search has made it shorter."""
@@ -360,9 +306,9 @@ class Linearised:
                 steps.append(Step(size, own=False))
                 return step
         own = bool(steps) or not self._tangents.near(state, self._near)
-        anew = sum(step.own for step in steps) == OLD
+        anew = sum(step.own for step in steps) == OLD and not self.foreseeing
         factors = self._tangents.at(state, self._stress, rough=not anew, sure=False) if own else self._tangents.latest
-        matrix = Bordered(self._system, factors, state, self._name, self._row)
+        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangents.rough)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))

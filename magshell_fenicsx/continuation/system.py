@@ -1,6 +1,6 @@
 """The interface of a system to the solvers: vectors, a matrix and named amplitudes, no shells."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -39,11 +39,14 @@ class Beside:
     ----------
     changing
         What may be that of an earlier state: D and its part in K; D alone if None.
+    present
+        The product of that of the present state with a vector, dear; None if nothing is older. Collective.
     """
 
     K: PETSc.Mat
     D: Rest
     changing: Rest | None = None
+    present: Callable[[Vector], Vector] | None = None
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,9 @@ class Roughly(Protocol):
 
     @property
     def dear(self) -> bool: ...
+
+    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
+        """As that of `System`; if `rough`, forces of that part may be foreseen from states before."""
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Tangent:
         """As that of `System`; if `rough`, that part may be that of an earlier state."""

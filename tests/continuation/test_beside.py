@@ -88,3 +88,21 @@ def test_what_is_not_small() -> None:
     factors.factor(Beside(matrix(K0), Full(D)))
     assert factors.doubt == np.inf
     assert factors.negative_pivots == np.sum(np.linalg.eigvalsh(K0 + D) < 0) > 0
+
+
+def test_an_older_part_is_corrected_where_the_count_depends_on_it() -> None:
+    """D of an earlier state, by which K + D is still definite: the count is that of the present, by two products."""
+    K, D = beside([0.02], -0.015, 1e-5)
+    present, products = 1.5 * D, 0
+
+    def times(v: Array) -> Array:
+        nonlocal products
+        products += 1
+        return present @ v
+
+    factors = Factorisation(MPI.COMM_SELF)
+    factors.factor(Beside(matrix(K), Full(D), Full(D), times))
+    of_older, of_present = (int(np.sum(np.linalg.eigvalsh(K + each) < 0)) for each in (D, present))
+    assert factors.negative_pivots == of_present != of_older
+    assert factors.doubt < 1.0
+    assert 0 < products <= 2

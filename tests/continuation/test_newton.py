@@ -8,8 +8,8 @@ from continuation.toys import Toy, pitchfork
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
+from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
 from magshell_fenicsx.continuation.newton import BorderedNewton, Outcome
-from magshell_fenicsx.continuation.snes import Iterates, Step, Verdict
 from magshell_fenicsx.continuation.system import State
 
 FULL, CHORD = True, False

@@ -2,6 +2,7 @@
 
 from copy import copy
 from functools import cached_property
+from itertools import count, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,8 +30,66 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
+CHANGES = 4  # latest ones that are remembered
+OWN = 0.3  # of a change: what newer ones do not have, at least
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
+
+
+class Foreseen:
+    """Forces near a state at which they were computed, by an earlier second derivative D and latest changes.
+
+    Of the latest states s are the differences and y those of their forces: what y - D s are along s is added to D, that
+    of the newest first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+    """
+
+    def __init__(self) -> None:
+        self._known = list[tuple[Array, Array]]()  # u of all nodes and this rank's part of the forces, the newest last
+        self._of: ActingOnEachOther | None = None
+        self._products = dict[int, Array]()  # D s, by the number of the later state
+        self._count = 0
+        self._basis: list[tuple[Array, Array]] | None = None
+
+    def learn(self, u: Array, forces: Array) -> None:
+        """Forces at a state."""
+        self._known, self._basis, self._count = [*self._known[-CHANGES:], (u, forces)], None, self._count + 1
+
+    def at(self, u: Array, D: "ActingOnEachOther") -> Array | None:
+        """This rank's part of the forces; None if nothing is known."""
+        if not self._known:
+            return None
+        before, forces = self._known[-1]
+        s = u - before
+        foreseen = forces + _product(D, s)
+        for q, y in self._changes(D):
+            foreseen += (q @ s) * y
+        return foreseen
+
+    def _changes(self, D: "ActingOnEachOther") -> list[tuple[Array, Array]]:
+        """Orthonormal changes of u, and what D lacks along them."""
+        if D is not self._of:
+            self._of, self._products, self._basis = D, {}, None
+        if self._basis is None:
+            self._basis, newest = [], self._count
+            pairs = list(pairwise(reversed(self._known)))
+            self._products = {k: v for k, v in self._products.items() if k > newest - len(pairs)}
+            for number, ((u, forces), (u0, forces0)) in zip(count(newest, -1), pairs):
+                s = u - u0
+                if number not in self._products:
+                    self._products[number] = _product(D, s)
+                y, size = forces - forces0 - self._products[number], float(np.linalg.norm(s))
+                for _ in range(2):
+                    for q, of_q in self._basis:
+                        part = float(q @ s)
+                        s, y = s - part * q, y - part * of_q
+                rest = float(np.linalg.norm(s))
+                if rest > OWN * size:
+                    self._basis.append((np.asarray(s / rest), np.asarray(y / rest)))
+        return self._basis
+
+
+def _product(D: "ActingOnEachOther", v: Array) -> Array:
+    return np.asarray(D.stored @ v + D.times_others(v[:, None]).ravel())
 
 
 class InteractionTerm:
@@ -62,6 +121,7 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
+        self._foreseen = Foreseen()
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther]] | None = None  # and its deformed nodes
 
     def antisymmetric(self) -> "InteractionTerm":
@@ -102,9 +162,13 @@ class InteractionTerm:
         """A sum over pairs of charges."""
 
     def add_residual(self, b: Array, factor: float) -> None:
-        V = self._u.function_space
-        local = V.dofmap.list[: len(self._cells.own)]
-        np.add.at(b.reshape(-1, 3), local, factor * self._evaluated()[1])
+        b += factor * self._evaluated()[1]
+
+    def add_foreseen(self, b: Array, factor: float) -> None:
+        """See `assembly.whole.WholeTerm`."""
+        self._nodes()  # what is known is forgotten if shape or remanence changed
+        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0]) if self._stiff else None
+        b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
 
     def compile_tangent(self) -> None:
         """A sum over pairs of charges."""
@@ -167,15 +231,19 @@ class InteractionTerm:
         return even, odd
 
     def _evaluated(self) -> tuple[float, Array]:
-        """The energy of this rank's part and its gradient by the nodes of own cells; collective."""
-        nodes = self._nodes()
+        """The energy of this rank's part and its gradient by local nodes; collective."""
+        nodes, V = self._nodes(), self._u.function_space
         if self._seen is None or not np.array_equal(nodes, self._seen[0]):
             try:
                 energy, gradient = self._charged.evaluate(nodes, self._cells.own)
             except Touching:  # there is no such equilibrium
                 k = self._cells.nodes.shape[1]
                 energy, gradient = np.nan, np.full((len(self._cells.own), k, 3), np.nan)
-            self._seen = nodes, self._scale * energy, self._scale * gradient
+            forces = np.zeros_like(self._u.x.array)
+            np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient)
+            self._seen = nodes, self._scale * energy, forces
+            if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
+                self._foreseen.learn(whole(self._u).ravel(), forces)
         return self._seen[1:]
 
     def _nodes(self) -> Array:
@@ -184,7 +252,7 @@ class InteractionTerm:
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff = given, None, None
+            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen()
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])

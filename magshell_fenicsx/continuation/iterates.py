@@ -1,0 +1,109 @@
+"""The steps of one solve by Newton's method, from which alone its convergence is judged."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
+SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
+GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
+STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
+STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
+SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
+ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
+
+Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The next step at an iterate.
+
+    Attributes
+    ----------
+    size
+        Size of the step, see `Bordered.size`.
+    own
+        Whether the matrix was computed at this iterate.
+    pivots
+        Its negative ones.
+    """
+
+    size: float
+    own: bool
+    pivots: int = 0
+
+
+@dataclass
+class Iterates:
+    """The steps of one solve, in lengths of the system, from which alone its convergence is judged.
+
+    Parameters
+    ----------
+    largest
+        A longer step counts as divergence.
+    patience
+        Matrices after which steps must have shrunk.
+    searched
+        Whether a line search shortens them: then they may grow.
+    kinks
+        Whether steps may shrink suddenly less: then none is foreseen.
+    hasty
+        Whether the solve is given up early where a shorter step of the path costs less.
+    """
+
+    largest: float = np.inf
+    patience: int = 4
+    searched: bool = False
+    kinks: bool = False
+    hasty: bool = False
+    steps: list[Step] = field(default_factory=list)
+
+    @property
+    def foreseen(self) -> float:
+        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
+        if self.kinks or self.searched or len(self.steps) < 2:
+            return np.inf
+        rate = self.steps[-1].size / self.steps[-2].size
+        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
+
+    @property
+    def error(self) -> float:
+        """The estimated error after the last step."""
+        return min(self.steps[-1].size, self.foreseen) if self.steps else np.inf
+
+    def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
+        """The verdict on the iterate, from the last step.
+
+        Parameters
+        ----------
+        tolerance
+            Of the iterate's error.
+        rounding
+            Computes the error from rounding of the residual.
+        """
+        step, before = self.steps[-1], self.steps[:-1]
+        if not step.size <= self.largest:
+            return "far" if self.hasty else "diverged"
+        if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
+            return "converged"
+        own = [s for s in before if s.own]
+        full = [s.size for s in own]
+        if self.hasty and step.own and self._astray(own, step):
+            return "far"
+        stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
+        if stalled and step.size <= ROUNDING * rounding():
+            return "rounding"
+        if step.own and len(before) > 2 and full and step.size > 2 * full[-1] and not self.searched:
+            return "diverged"
+        if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
+            return "diverged"
+        return "go on"
+
+    def _astray(self, before: Sequence[Step], step: Step) -> bool:
+        """Whether steps with matrices of their own lead away, past an instability, or stay long."""
+        if len(before) == 1:
+            return step.size > FULL * before[0].size and step.pivots != before[0].pivots
+        return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
