@@ -9,7 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.control import projected
-from magshell_fenicsx.continuation.interpolated import stationary
+from magshell_fenicsx.continuation.interpolated import crossed, stationary
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
@@ -433,13 +433,34 @@ class Walk:
         """The targets between two points, each solved for."""
         path, quantity, targets = self.path, self.goal.quantity, self.goal.targets
         a, b = path.value(quantity, low.state), path.value(quantity, high.state)
+        around = [] if path.newton.options.kinks else self.points[-2:-1]  # no polynomial goes on behind a corner
+        around = [path.seen_from(low, path.measured_from(low, point)) for point in (*around, low, high)]
         for target in targets:
             if a == target and (b - a) * self.goal.sense < 0:  # a shorter step sees the load rise first
                 raise PathStopped(f"{path.name} falls from the start", low)
             if (target - a) * (target - b) < 0 or b == target:
-                s = low.s + (target - a) / (b - a) * (high.s - low.s)
-                guess = path.between(s, low, path.seen_from(low, high))
-                point = path.solve(path.given(quantity, target), s, guess)
-                if isinstance(point, str):
-                    raise PathStopped(point, low)
+                point = self._at_target(target, around)
+                around.insert(-1, path.seen_from(low, path.measured_from(low, point)))
                 yield "target", point, self.goal.until in ("target", "limit") and target == targets[-1]
+
+    def _at_target(self, target: float, around: Sequence[Point]) -> Point:
+        """The point at a target between the last two of some points, from the polynomial through the last four.
+
+        Raises
+        ------
+        PathStopped
+            If none is found.
+        """
+        path, quantity = self.path, self.goal.quantity
+        low, high = around[-2:]
+
+        def missed(s: float) -> float:
+            return path.value(quantity, path.between(s, *around[-4:])) - target
+
+        s = crossed(missed, low.s, high.s, (missed(low.s), missed(high.s)))
+        t = (s - low.s) / (high.s - low.s)
+        stress = [(1 - t, low.state.u), (t, high.state.u)]
+        point = path.solve(path.given(quantity, target), s, path.between(s, *around[-4:]), stress)
+        if isinstance(point, str):
+            raise PathStopped(point, low)
+        return point
