@@ -112,10 +112,12 @@ class SensorsSeen(Seen):
         return dict(zip(columns, map(float, readings.ravel()), strict=True))
 
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
+        if not sight.loads.sensors:
+            return {}
         from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
 
         of = magnetised(sight.loads)
-        if of is None or not sight.loads.sensors:
+        if of is None:
             return {}
         own, at = own_field(sight), sight.model.system.at(state)
         moment = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
