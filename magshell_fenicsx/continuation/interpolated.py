@@ -1,12 +1,9 @@
 """Polynomials through some points."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
-
-MOST_TRIALS = 20
-CLOSE = 1e-6  # of the way that is left between two places: nearer ones are the same
 
 
 def slope(places: Sequence[float]) -> list[tuple[float, float]]:
@@ -28,20 +25,3 @@ def stationary(rise: float, d0: float, d1: float) -> float:
     inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
     t = inside[0] if inside else d0 / (d0 - d1)
     return float(min(max(t, 1e-3), 1 - 1e-3))
-
-
-def crossed(f: Callable[[float], float], low: float, high: float, ends: tuple[float, float]) -> float:
-    """About where a function is zero between two places with values of different sign, by Illinois' regula falsi."""
-    a, b = ends
-    place, side = high, 0
-    for _ in range(MOST_TRIALS if a * b < 0 else 0):
-        before, place = place, low + (high - low) * a / (a - b)
-        if abs(place - before) <= CLOSE * abs(high - low) or not (value := f(place)):
-            break
-        if value * b < 0:
-            low, a, b = place, value, b / 2 if side < 0 else b
-            side = -1
-        else:
-            high, b, a = place, value, a / 2 if side > 0 else a
-            side = 1
-    return place

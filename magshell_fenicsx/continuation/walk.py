@@ -9,11 +9,12 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.control import projected
-from magshell_fenicsx.continuation.interpolated import crossed, stationary
+from magshell_fenicsx.continuation.interpolated import stationary
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted, max_abs
+from magshell_fenicsx.continuation.targets import targets_between
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
@@ -426,41 +427,7 @@ class Walk:
             if ends:
                 break
         if self._by_arc and self.goal.targets:
-            events += self._crossed(low, high)
+            until, last, before = self.goal.until in ("target", "limit"), self.goal.targets[-1], self.points[-2:-1]
+            for target, point in targets_between(self.path, self.goal, before, low, high):
+                events.append(("target", point, until and target == last))
         return sorted(events, key=lambda item: abs(item[1].s - low.s))
-
-    def _crossed(self, low: Point, high: Point) -> Iterator[tuple[Label, Point, bool]]:
-        """The targets between two points, each solved for."""
-        path, quantity, targets = self.path, self.goal.quantity, self.goal.targets
-        a, b = path.value(quantity, low.state), path.value(quantity, high.state)
-        around = [] if path.newton.options.kinks else self.points[-2:-1]  # no polynomial goes on behind a corner
-        around = [path.seen_from(low, path.measured_from(low, point)) for point in (*around, low, high)]
-        for target in targets:
-            if a == target and (b - a) * self.goal.sense < 0:  # a shorter step sees the load rise first
-                raise PathStopped(f"{path.name} falls from the start", low)
-            if (target - a) * (target - b) < 0 or b == target:
-                point = self._at_target(target, around)
-                around.insert(-1, path.seen_from(low, path.measured_from(low, point)))
-                yield "target", point, self.goal.until in ("target", "limit") and target == targets[-1]
-
-    def _at_target(self, target: float, around: Sequence[Point]) -> Point:
-        """The point at a target between the last two of some points, from the polynomial through the last four.
-
-        Raises
-        ------
-        PathStopped
-            If none is found.
-        """
-        path, quantity = self.path, self.goal.quantity
-        low, high = around[-2:]
-
-        def missed(s: float) -> float:
-            return path.value(quantity, path.between(s, *around[-4:])) - target
-
-        s = crossed(missed, low.s, high.s, (missed(low.s), missed(high.s)))
-        t = (s - low.s) / (high.s - low.s)
-        stress = [(1 - t, low.state.u), (t, high.state.u)]
-        point = path.solve(path.given(quantity, target), s, path.between(s, *around[-4:]), stress)
-        if isinstance(point, str):
-            raise PathStopped(point, low)
-        return point
