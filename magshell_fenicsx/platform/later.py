@@ -6,18 +6,12 @@ from typing import Any
 
 
 def later(name: str) -> Any:
-    """A package that is imported when something of it is asked for, as `importlib` offers.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If there is none.
-    """
+    """A package that is imported when something of it is asked for, as `importlib` offers."""
     if name in sys.modules:
         return sys.modules[name]
     spec = find_spec(name)
-    if spec is None or spec.loader is None:
-        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+    assert spec, name
+    assert spec.loader, name
     spec.loader = LazyLoader(spec.loader)
     module = sys.modules[name] = module_from_spec(spec)
     spec.loader.exec_module(module)
