@@ -208,7 +208,7 @@ class MeridianModel(Thin):
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
-        follows = self.growing or self.contacts or self.fields or self.loads.moves
+        follows = self.growing or self.contacts or self.fields or self.factory.saturated or self.loads.moves
         if follows or any(e.density is None or e.counted for e in self.energies):
             return None
         free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
