@@ -13,7 +13,6 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.runs.gradients import gradients_after
 from magshell_fenicsx.runs.modes import frequencies_after
 from magshell_fenicsx.runs.running import run as run_problem
 from magshell_fenicsx.runs.summary import Result
@@ -214,5 +213,8 @@ def run(
     if out is None:  # with a folder they are there already
         on_first: Say = say if comm.rank == 0 else lambda line: None
         frequencies_after(result, None, on_first)
-        gradients_after(result, None, on_first)
+        if problem.gradients is not None:
+            from magshell_fenicsx.runs.gradients import gradients_after
+
+            gradients_after(result, None, on_first)
     return result

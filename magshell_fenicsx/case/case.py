@@ -22,7 +22,7 @@ from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_str
 from magshell_fenicsx.case.merged import expanded, written
 from magshell_fenicsx.case.shells import Several, Shells
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, numbers_with_units
+from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, Later, digests, numbers_with_units
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.press import approaches
@@ -73,13 +73,13 @@ class Case(WithParts):
     """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. Formulas
     and results are over the R, h, E and density of the first. The edge or point `rim` of the shell `upper` is
     `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
-    magnetic: MagneticSection | None = None
+    magnetic: Annotated[MagneticSection, Later(MagneticSection)] | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
     """Name -> point at which the magnetic field is read"""
     field_maps: FieldMaps = Field(default_factory=dict)
     """Name -> grid on which the magnetic field is computed, for ParaView and drawn"""
-    natural: NaturalSection | None = None
+    natural: Annotated[NaturalSection, Later(NaturalSection)] | None = None
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)
     """Name -> rigid body that presses on the shell, or stands in its way"""
@@ -98,13 +98,13 @@ class Case(WithParts):
     """Lowest modes after the run"""
     frequencies: FrequenciesSection | None = None
     """Natural frequencies at points of the path"""
-    gradients: GradientsSection | None = None
+    gradients: Annotated[GradientsSection, Later(GradientsSection)] | None = None
     """Derivatives of results after the run"""
-    ensemble: EnsembleSection | None = None
+    ensemble: Annotated[EnsembleSection, Later(EnsembleSection)] | None = None
     """What is random, for `magshell ensemble`"""
-    design: DesignSection | None = None
+    design: Annotated[DesignSection, Later(DesignSection)] | None = None
     """What varies and what is wanted, for `magshell design`"""
-    identify: IdentifySection | None = None
+    identify: Annotated[IdentifySection, Later(IdentifySection)] | None = None
     """Which numbers measured data are to determine, for `magshell identify`"""
     output: OutputSection = OutputSection.model_construct()
     """How pictures look"""

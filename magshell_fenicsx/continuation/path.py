@@ -336,9 +336,9 @@ class Path:
             seen.pop(0)
         return self._joined(s, seen)
 
-    def between(self, s: float, low: Point, high: Point) -> State:
-        """A first guess at `s`: the Hermite cubic through two points."""
-        return self._joined(s, [low, high])
+    def between(self, s: float, *points: Point) -> State:
+        """A first guess at `s`: the Hermite polynomial through points with their tangents, a cubic through two."""
+        return self._joined(s, points)
 
     def _joined(self, s: float, points: Sequence[Point]) -> State:
         last, name = points[-1].state, self.name

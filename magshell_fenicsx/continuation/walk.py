@@ -14,6 +14,7 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted, max_abs
+from magshell_fenicsx.continuation.targets import targets_between
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
@@ -426,20 +427,8 @@ class Walk:
             if ends:
                 break
         if self._by_arc and self.goal.targets:
-            events += self._crossed(low, high)
+            until, targets = self.goal.until in ("target", "limit"), self.goal.targets
+            around = [*self.points[-2:-1], low, high]
+            for target, point in targets_between(self.path, self.goal.quantity, targets, self.goal.sense, around):
+                events.append(("target", point, until and target == targets[-1]))
         return sorted(events, key=lambda item: abs(item[1].s - low.s))
-
-    def _crossed(self, low: Point, high: Point) -> Iterator[tuple[Label, Point, bool]]:
-        """The targets between two points, each solved for."""
-        path, quantity, targets = self.path, self.goal.quantity, self.goal.targets
-        a, b = path.value(quantity, low.state), path.value(quantity, high.state)
-        for target in targets:
-            if a == target and (b - a) * self.goal.sense < 0:  # a shorter step sees the load rise first
-                raise PathStopped(f"{path.name} falls from the start", low)
-            if (target - a) * (target - b) < 0 or b == target:
-                s = low.s + (target - a) / (b - a) * (high.s - low.s)
-                guess = path.between(s, low, path.seen_from(low, high))
-                point = path.solve(path.given(quantity, target), s, guess)
-                if isinstance(point, str):
-                    raise PathStopped(point, low)
-                yield "target", point, self.goal.until in ("target", "limit") and target == targets[-1]

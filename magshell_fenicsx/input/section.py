@@ -295,7 +295,7 @@ class Chosen:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         choices = {
-            tag: handler.generate_schema(Annotated[section, _Later(section)])
+            tag: handler.generate_schema(Annotated[section, Later(section)])
             for section in get_args(source)
             for tag in get_args(section.model_fields[self.by].annotation)
         }
@@ -303,8 +303,8 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class _Later:
-    """A section whose validator is built when it is needed."""
+class Later:
+    """In an annotation: a section whose validator is built when a case has it."""
 
     section: type[BaseModel]
 

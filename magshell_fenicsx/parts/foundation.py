@@ -1,11 +1,9 @@
 """An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses that may vary."""
 
 from collections.abc import Iterable
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
-import ufl
 from pydantic import Field, model_validator
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import or_number
@@ -13,7 +11,14 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import ByPlace, OwnTerm
 from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
+from magshell_fenicsx.platform.later import later
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
+
+if TYPE_CHECKING:
+    import ufl
+    from ufl.core.expr import Expr
+else:
+    ufl = later("ufl")
 
 Number = Annotated[float, Field(gt=0)]
 Stiffness = Annotated[float, or_number("newton/metre**3", Number), Field(gt=0)]
@@ -83,16 +88,16 @@ class Foundation(Part):
         return {name: k * scales.R**2 / (scales.E * scales.h) for name, k in given.items() if k is not None}
 
 
-def energy(r0: Jet, u: Jet, force: Expr, factor: Expr | float = 1.0) -> Expr:
+def energy(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
     """The energy density for k = 1."""
     return factor * ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
 
 
-def reaction(r0: Jet, u: Jet, force: Expr, factor: Expr | float = 1.0) -> Expr:
+def reaction(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
     """The density of the reaction for k = 1, over the unit of the force."""
     return -factor * ufl.dot(u.r, kin.normal(r0)) / force
 
 
-def tangential_energy(r0: Jet, u: Jet, factor: Expr | float = 1.0) -> Expr:
+def tangential_energy(r0: Jet, u: Jet, factor: "Expr | float" = 1.0) -> "Expr":
     """The energy density for k_t = 1."""
     return factor * (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

@@ -3,10 +3,8 @@
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 from pydantic import Field
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.section import Along, over
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -15,11 +13,17 @@ from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.platform.later import later
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 from magshell_fenicsx.shape.symmetry import Leaves, unit
 
 if TYPE_CHECKING:
+    import ufl
+    from ufl.core.expr import Expr
+
     from magshell_fenicsx.shape.outline import Outline
+else:
+    ufl = later("ufl")
 
 ACCELERATION = Unit(
     "E/(ρ R)",
@@ -71,6 +75,6 @@ class GravityStep(BodyForceStep):
         return f"the shell's weight along [{along}], amplitude {step.name} = ρ g R/E"
 
 
-def energy(r0: Jet, u: Jet, along: Expr) -> Expr:
+def energy(r0: Jet, u: Jet, along: "Expr") -> "Expr":
     """The energy density for ρ g R/E = 1, zero where nothing has moved."""
     return -ufl.dot(u.r, along)

@@ -1,10 +1,9 @@
 """The shell spins about e3: centrifugal forces, which grow with the square of its speed."""
 
 from math import sqrt
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.section import over
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -14,6 +13,9 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
+
+if TYPE_CHECKING:
+    from ufl.core.expr import Expr
 
 SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)
 SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2), symbol="ω²")
@@ -59,6 +61,6 @@ class SpinStep(BodyForceStep):
         return f"centrifugal forces of a shell that spins about e3, amplitude {step.name} = ρ ω² R²/E"
 
 
-def energy(r0: Jet, u: Jet) -> Expr:
+def energy(r0: Jet, u: Jet) -> "Expr":
     """The energy density for ρ ω² R²/E = 1, zero where nothing has moved."""
     return -sum(u.r[i] * (r0.r[i] + u.r[i] / 2) for i in range(2))

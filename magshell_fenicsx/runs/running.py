@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from mpi4py import MPI
 
@@ -33,21 +33,18 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
 from magshell_fenicsx.runs.files import RunFiles, open_folder
-from magshell_fenicsx.runs.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.runs.modes import frequencies_after, modes_after, wanted
 from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
 from magshell_fenicsx.runs.status import RunProgress, waiting
 from magshell_fenicsx.runs.summary import Result, summary
-from magshell_fenicsx.simulate.adapt.branch import branch_error, branched
-from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
-from magshell_fenicsx.simulate.adapt.tolerance import adapted
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
-from magshell_fenicsx.simulate.results import barrier
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+
+if TYPE_CHECKING:  # a run imports what its case asks for
+    from magshell_fenicsx.simulate.adapt.choice import Adapted
 
 # mpirun passes SIGUSR1 on to the ranks and waits; SIGHUP is that of a terminal that is closed
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
@@ -199,7 +196,10 @@ def _run(
         chosen = _mesh_for_tolerance(problem, folder if resume else None, comm, say, doing)
         doing("mesh and kernels")
         scene = chosen.choice.scene(problem, comm) if chosen else Scene(problem, comm)
-        refuse_unknown(scene)
+        if problem.gradients is not None:
+            from magshell_fenicsx.runs.gradients import refuse_unknown
+
+            refuse_unknown(scene)
     except (CaseError, MeshError) as e:
         raise type(e)(problem.document.placed(str(e))) from None
     if chosen and chosen.branch:
@@ -248,7 +248,10 @@ def _run(
                     with result.output:
                         modes_after(result, folder, say)
                         frequencies_after(result, folder, say)
-                        gradients_after(result, folder, say)
+                        if problem.gradients is not None:
+                            from magshell_fenicsx.runs.gradients import gradients_after
+
+                            gradients_after(result, folder, say)
                         if pictures:
                             by_first(comm, partial(_draw, folder))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
@@ -270,10 +273,16 @@ def _draw(folder: Path) -> None:
     draw(folder)
 
 
-def _mesh_for_tolerance(problem: Problem, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
+def _mesh_for_tolerance(
+    problem: Problem, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say
+) -> "Adapted | None":
     """The mesh for the tolerance, that of an interrupted run if its folder has one; None for the default."""
     if problem.mesh.tolerance is None:
         return None
+    from magshell_fenicsx.simulate.adapt.branch import branched
+    from magshell_fenicsx.simulate.adapt.choice import Adapted
+    from magshell_fenicsx.simulate.adapt.tolerance import adapted
+
     file = folder / MESH if folder else None
     if file and (saved := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
         try:
@@ -299,6 +308,8 @@ def _branch_error(result: Result) -> float | None:
     assert result.adapted
     if result.adapted.branch is None or result.latest is None or result.latest.scene is result.scene:
         return None
+    from magshell_fenicsx.simulate.adapt.branch import branch_error
+
     try:
         return branch_error(result.adapted.branch, result.latest)
     except NoResult:
@@ -311,6 +322,8 @@ def _sensitivities(result: Result) -> dict[str, float]:
     step = scene.problem.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
     if step is None or not step.load.wants_sensitivities:
         return {}
+    from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+
     assert result.walked.located
     record = result.walked.located[-1]
     scene = record.scene or scene
@@ -326,6 +339,8 @@ def _barrier(result: Result) -> float | None:
     steps, begin = result.scene.problem.programme, result.walked.begin
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
+    from magshell_fenicsx.simulate.results import barrier
+
     assert result.walked.last
     return barrier(result.scene, steps[-1], begin.point.state, result.walked.last.point.state)
 

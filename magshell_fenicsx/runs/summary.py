@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -20,10 +20,12 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shape.sections import ShellSection, Surface
 from magshell_fenicsx.shells.modes import ShellMode
-from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.simulate.adapt.choice import Adapted
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -110,7 +112,7 @@ class Result:
     replayed: int = 0
     sensitivities: dict[str, float] = field(default_factory=dict)
     output: Stopwatch = field(default_factory=Stopwatch)
-    adapted: Adapted | None = None
+    adapted: "Adapted | None" = None
     branch_error: float | None = None
     walked: History = field(default_factory=History)
     barrier: float | None = None

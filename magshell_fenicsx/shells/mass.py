@@ -7,6 +7,7 @@ With the displacement u + E(mu(t)), E at nodes that move, the mass is that of al
 from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from operator import mul
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import ufl
@@ -21,11 +22,13 @@ from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.solid import SolidModel
 
-Model = ShellModel | MeridianModel | SolidModel
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
+    from magshell_fenicsx.shells.solid import SolidModel
+
+Model: TypeAlias = "ShellModel | MeridianModel | SolidModel"
 
 
 def mass(model: Model) -> PETSc.Mat:
@@ -59,7 +62,7 @@ def of_displacements(model: Model, factor: Expr | float) -> ufl.Form:
     return _integral(model, model.carrier.whole * product if model.thin else product)
 
 
-def of_waves(model: MeridianModel, factor: Expr | float) -> ufl.Form:
+def of_waves(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
     cosine, sine = zip(*(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)

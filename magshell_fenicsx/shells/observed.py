@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import ufl
@@ -28,8 +28,10 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
-from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.shells.terms import EnergyFactory
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
 
@@ -85,7 +87,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
-    touchings: Sequence[Touching] = ()
+    touchings: "Sequence[Touching]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None

@@ -42,7 +42,6 @@ from magshell_fenicsx.parts.forces.dead_load import (
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
-from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import beside, on_cells, openings
 from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
@@ -54,10 +53,7 @@ from magshell_fenicsx.parts.supports.supports import (
     put_in_plane,
     refuse_unknown,
 )
-from magshell_fenicsx.parts.touching.building import touchings
-from magshell_fenicsx.parts.touching.mirrored import Mirrored
 from magshell_fenicsx.shells.observed import Thin
-from magshell_fenicsx.shells.tee import tees
 from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
@@ -238,6 +234,8 @@ class ShellModel(Thin):
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
         if loads.interaction:
+            from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm  # few shells have one
+
             terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {
@@ -249,13 +247,18 @@ class ShellModel(Thin):
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
-        rule = carrier.contact_rule
-        of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
-        thick = factor, factory.law_of_cells.thins
-        surfaces = self.r0, self.u, midsurface.patches
-        self.touchings = touchings(loads.pairs, *surfaces, material.h, rule, *thick, *of_images, shape)
-        terms += self.touchings
-        terms += tees(self)
+        if loads.pairs:
+            from magshell_fenicsx.parts.touching.building import touchings
+
+            of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
+            thick = carrier.contact_rule, factor, factory.law_of_cells.thins
+            surfaces = self.r0, self.u, midsurface.patches
+            self.touchings = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape)
+            terms += self.touchings
+        if loads.joints or midsurface.feet:
+            from magshell_fenicsx.shells.tee import tees
+
+            terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:
@@ -315,7 +318,7 @@ class ShellModel(Thin):
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
-        terms = [t.antisymmetric() if isinstance(t, InteractionTerm | Mirrored) else t for t in terms]
+        terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]
         system = self.system
         return AntisymmetricModes(
             FiniteElementSystem(

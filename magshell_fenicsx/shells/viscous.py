@@ -8,6 +8,7 @@ strains, so that rigid motions are not damped. Strains are known at the nodes of
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
@@ -27,8 +28,10 @@ from magshell_fenicsx.models.shell.law import Law, work
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.shell import ShellModel
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
 SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space
@@ -82,7 +85,7 @@ class Viscosity:
 
     def __init__(
         self,
-        model: ShellModel | MeridianModel,
+        model: "ShellModel | MeridianModel",
         mu: Amplitudes,
         kelvin: float,
         branches: Sequence[Branch],
@@ -196,7 +199,7 @@ class _Slowing:
     Viscous stresses are those of small strains: they make stiff what the strains of a stretched shell leave soft.
     """
 
-    def __init__(self, model: ShellModel | MeridianModel) -> None:
+    def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _Rates(model), ufl.TestFunction(model.V)
         self._since, whole = rates.since, model.factory.carrier.whole
@@ -269,7 +272,7 @@ class _Given:
 class _Rates:
     """What takes the place of `_Given` in the forces' derivative: strains and jumps by a change of a displacement."""
 
-    def __init__(self, model: ShellModel | MeridianModel) -> None:
+    def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self.since, self._change = fem.Function(model.V), ufl.TrialFunction(model.V)
         self._jet = model.factory.carrier.jet(self.since)
 
@@ -307,7 +310,7 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
     return held_jump(r0, m, n0 if edge.turn is None else ufl.dot(edge.turn, n0))
 
 
-def _works(model: ShellModel | MeridianModel, given: _Given | _Rates) -> list[ufl.Form]:
+def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[ufl.Form]:
     """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
 
     Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.

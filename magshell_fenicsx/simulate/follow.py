@@ -12,11 +12,9 @@ from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.stage import plain
 from magshell_fenicsx.simulate.steps import LOCATED, departure_of, followed_on, held_by, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
-from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
 
 RISES = 4  # first steps of an energy that moves the undeformed shell
@@ -89,6 +87,8 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                     remark(where + _buckled(scene, record, first))
             further = None
             if release and record:
+                from magshell_fenicsx.simulate.transient import released
+
                 further = released(scene, release, record, held_by(scene, step, record.point.state))
             elif step.load.follows_branch and record and last == "bifurcation":
                 further = followed_on(scene, step, record)
@@ -105,8 +105,11 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             remark(f"{BEYOND}{where}{e}{strange}")
             return
         begin, state = state, walked.end
-        for record in searched(scene, step, begin, state) if search else ():
-            yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
+        if search and step.load.search:
+            from magshell_fenicsx.simulate.search import searched
+
+            for record in searched(scene, step, begin, state):
+                yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
 

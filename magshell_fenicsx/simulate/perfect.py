@@ -1,6 +1,7 @@
 """The modes of the perfect shell that a problem has as imperfections: computed once, before a scene is built."""
 
 import json
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -13,14 +14,16 @@ from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mirrored, Shape, on_meridian, on_surface
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.shells.revolution import nodal_normals
-from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import LOCATED
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
 _known: dict[str, tuple[Shape, ...]] = {}  # a sweep has many cases with one perfect shell
@@ -80,7 +83,7 @@ def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
     return in_frame(Mirrored(whole, mirror, sign), -scene.problem.azimuth)
 
 
-def _wave(model: MeridianModel, mode: ShellMode) -> Shape:
+def _wave(model: "MeridianModel", mode: ShellMode) -> Shape:
     """From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode."""
     m = int(mode.label.removeprefix("m = ") or 0)
     V = model.waves.V if m else model.V
@@ -92,7 +95,7 @@ def _wave(model: MeridianModel, mode: ShellMode) -> Shape:
     return on_meridian(rho, z, -np.einsum("ij,ij->i", along, normal), m)
 
 
-def _at_nodes(scene: Scene, model: ShellModel, mode: ShellMode) -> tuple[Array, Array]:
+def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:
     """All nodes (n, 3) and the inward displacements (n,) there, on every rank."""
     V, comm = model.V, scene.comm
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]

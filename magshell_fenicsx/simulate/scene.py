@@ -39,17 +39,19 @@ from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.solid import SolidModel
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.shells.shell import ShellModel
+    from magshell_fenicsx.shells.solid import SolidModel
     from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
 
 
-def build_model(problem: Problem, comm: MPI.Comm) -> ShellModel:
+def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
     """The whole shell, half of it or a sector, on all ranks together."""
+    from magshell_fenicsx.shells.shell import ShellModel  # a meridian does without
+
     surface = build_midsurface(problem, comm)
     model = ShellModel(
         surface,
@@ -84,8 +86,9 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
     )
 
 
-def build_solid_model(problem: Problem, comm: MPI.Comm) -> SolidModel:
+def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     """The whole body or half of it, on all ranks together."""
+    from magshell_fenicsx.shells.solid import SolidModel
 
     def factor(x: Array) -> Array:
         thicknesses = (problem.thickness or Thickness()).at(x)

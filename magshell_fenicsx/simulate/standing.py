@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -12,9 +12,11 @@ from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.parts.natural.shape import natural_field
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
 
 FIELDS = {"magnetic": {"remanent"}, "shell": {"thickness_factor"}, "natural": {"curvature"}}
 
@@ -91,7 +93,7 @@ def _patches(problem: Problem) -> bool:
     return drawn or bool((magnetic and magnetic.patches) or (thickness and thickness.patches))
 
 
-def _put(model: ShellModel | MeridianModel, problem: Problem) -> None:
+def _put(model: "ShellModel | MeridianModel", problem: Problem) -> None:
     magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
     coefficients = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
     if magnetic and callable(magnetic.remanent):

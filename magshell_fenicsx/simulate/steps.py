@@ -16,7 +16,6 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
 from magshell_fenicsx.simulate.touch import touched
-from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed, off_path
 
 LOCATED = ("fold", "bifurcation")
@@ -32,6 +31,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     """
     load = step.load
     if load.motion:
+        from magshell_fenicsx.simulate.transient import motion  # steps at rest do without
+
         return (yield from motion(scene, load.motion, state, held_by(scene, step, state)))
     if load.touches:
         state = touched(scene, step, state)

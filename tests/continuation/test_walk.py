@@ -140,3 +140,14 @@ def test_a_renewal_that_fails_shortens_the_step() -> None:
     assert len(steps) == 5
     assert refused[:2] == pytest.approx([0.1, 0.025])
     assert np.diff([start.s, *(point.s for point in steps)]).max() <= 0.02
+
+
+def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
+    """Long steps with several targets within each, passed upwards and downwards: the polynomial is a good guess."""
+    targets = [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]
+    found = [p for label, p in walked(Goal("points", targets, "load", steps=14), 0.3, 0.6) if label == "target"]
+    x = np.array([p.state.u[1] for p in found])
+    exact = [np.sort(np.roots([1, -3, 2, -mu]).real)[k] for mu in targets for k in range(2)]
+    assert np.sort(x)[:12] == pytest.approx(np.sort(exact), abs=1e-9)
+    assert np.mean([p.iterations for p in found]) < 4
+    assert np.all(np.diff(x) > 0)  # in the order of the path

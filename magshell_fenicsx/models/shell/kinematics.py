@@ -5,12 +5,19 @@ expression is covariant under linear changes of the coordinates: finite-element 
 an orthonormal frame t_1, t_2 of the flat cell, the fast tangent those of the reference cell.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-import ufl
-from ufl.core.expr import Expr
+from magshell_fenicsx.platform.later import later
+
+if TYPE_CHECKING:
+    import ufl
+    from ufl.core.expr import Expr
+else:
+    ufl = later("ufl")
 
 Vectors: TypeAlias = Any  # several expressions (3,), or arrays (..., 3)
 FIRST = ("r1", "r2")
@@ -34,13 +41,13 @@ class Jet:
         """The six vectors."""
         return [getattr(self, f.name) for f in fields(self)]
 
-    def __add__(self, other: "Jet") -> "Jet":
+    def __add__(self, other: Jet) -> Jet:
         return Jet(*(a + b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
-    def __sub__(self, other: "Jet") -> "Jet":
+    def __sub__(self, other: Jet) -> Jet:
         return Jet(*(a - b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
-    def side(self, sign: str) -> "Jet":
+    def side(self, sign: str) -> Jet:
         """The same on one side ('+' or '-') of an edge."""
         return Jet(*(a(sign) for a in self.parts()))
 
@@ -190,7 +197,7 @@ class Edge:
     stretch: Expr
 
     @classmethod
-    def of(cls, r0: Jet, m: Expr) -> "Edge":
+    def of(cls, r0: Jet, m: Expr) -> Edge:
         """That of a covector as of `conormal`."""
         nu1, nu2, stretch = conormal(r0, m)
         t1, t2 = -m[1] / stretch, m[0] / stretch

@@ -1,5 +1,7 @@
 """An energy of the mid-surface or of an edge, a part's or one's own, from nothing but its density."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -8,34 +10,36 @@ from math import isfinite, prod
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import basix.ufl
 import numpy as np
-import ufl
 from numpy.typing import NDArray
-from ufl import Coefficient, Constant
-from ufl.algorithms import expand_derivatives, extract_coefficients
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.constantvalue import Zero
-from ufl.core.expr import Expr
-from ufl.corealg.traversal import traverse_unique_terminals
-from ufl.geometry import GeometricQuantity
 
 from magshell_fenicsx.input.expressions import function
 from magshell_fenicsx.mesh.mirror import Y0, Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
+from magshell_fenicsx.platform.later import later
 from magshell_fenicsx.shape.symmetry import Leaves, mirrors_formula
 from magshell_fenicsx.shape.turning import scalar_turns
 
 if TYPE_CHECKING:
+    import ufl
+    from ufl import Coefficient
+    from ufl.core.expr import Expr
+
     from magshell_fenicsx.shape.outline import Outline
+else:
+    ufl = later("ufl")
 
 Array = NDArray[np.float64]
-SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
-SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}  # functions of formulas
 Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
 SAME = 1e-10  # difference of two values that is rounding, over the larger
+
+
+def symbolic_functions() -> dict[str, Callable[..., Any]]:
+    """UFL's functions of formulas."""
+    same = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+    return same | {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class ByPlace:
     turn: float = 0.0
 
     @property
-    def of_place(self) -> "Callable[[Array, Array, Array], Array]":
+    def of_place(self) -> Callable[[Array, Array, Array], Array]:
         """The formula as a function of arrays of coordinates in the model's frame."""
         of_case = function(self.text)
         if not self.turn:
@@ -79,11 +83,11 @@ class ByPlace:
         Q = rotation(self.turn)
         return lambda x, y, z: of_case(*(Q[0, i] * x + Q[1, i] * y + Q[2, i] * z for i in range(3)))
 
-    def turns(self, outline: "Outline") -> bool:
+    def turns(self, outline: Outline) -> bool:
         """Whether it is the same all around e3."""
         return outline.span is not None and scalar_turns(self.text, outline.span)
 
-    def mirrored(self, mirror: Mirror, outline: "Outline") -> bool:
+    def mirrored(self, mirror: Mirror, outline: Outline) -> bool:
         """Whether a plane mirrors it."""
         return mirrors_formula(self.text, mirror, outline.sample())
 
@@ -171,7 +175,7 @@ class OwnTerm:
             raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
 
     @property
-    def densities(self) -> "tuple[Callable[..., Expr], ...]":
+    def densities(self) -> tuple[Callable[..., Expr], ...]:
         """Its energy's, if it has one, then those that it observes."""
         return (*((self.density,) if self.density else ()), *self.observed.values())
 
@@ -193,7 +197,7 @@ class OwnTerm:
     @property
     def varying(self) -> bool:
         """Whether a parameter is a function of the place."""
-        return any(isinstance(p, GivenField | Coefficient) for p in self.parameters)
+        return any(isinstance(p, GivenField | ufl.Coefficient) for p in self.parameters)
 
     @property
     def by_place(self) -> tuple[ByPlace, ...]:
@@ -202,7 +206,7 @@ class OwnTerm:
 
     def with_functions(
         self, made: Callable[[ByPlace], Coefficient], carried: Callable[[GivenField], Coefficient] | None = None
-    ) -> "OwnTerm":
+    ) -> OwnTerm:
         """With functions of numbers (size,) on a model's mesh in place of formulas and of fields that were given."""
 
         def function_of(p: Any) -> Any:
@@ -212,7 +216,7 @@ class OwnTerm:
 
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
-    def turned(self, angle: float) -> "OwnTerm":
+    def turned(self, angle: float) -> OwnTerm:
         """The same in a frame that is turned about e3 (rad)."""
         if not angle or (self.turns and not self.by_place):
             return self
@@ -242,7 +246,7 @@ class OwnTerm:
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density that takes a function of one number as a vector of one."""
-        alone = [isinstance(p, Coefficient) and p.ufl_shape == (1,) for p in self.parameters]
+        alone = [isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters]
         if not any(alone):
             return density
 
@@ -256,7 +260,8 @@ class OwnTerm:
     def linear(self) -> bool:
         """Whether the density is linear in the displacement: its second derivatives vanish identically."""
         W, parts = self._symbolic.W, [getattr(self._symbolic.u, name) for name in self.parts]
-        return all(isinstance(expand_derivatives(ufl.diff(ufl.diff(W, a), b)), Zero) for a in parts for b in parts)
+        second = (ufl.algorithms.expand_derivatives(ufl.diff(ufl.diff(W, a), b)) for a in parts for b in parts)
+        return all(isinstance(each, ufl.constantvalue.Zero) for each in second)
 
     @cached_property
     def turns(self) -> bool:
@@ -285,7 +290,7 @@ class OwnTerm:
             return False
         return all(self._same(sample, image(*sample)) for sample in _random_samples())
 
-    def leaves(self, outline: "Outline") -> Leaves:
+    def leaves(self, outline: Outline) -> Leaves:
         """The symmetry that it leaves."""
         turns = self.turns and all(p.turns(outline) for p in self.by_place)
 
@@ -308,8 +313,10 @@ class OwnTerm:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @cached_property
-    def _symbolic(self) -> "Symbolic":
+    def _symbolic(self) -> Symbolic:
         """The density, and what it is written with."""
+        import basix.ufl
+
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
@@ -331,12 +338,13 @@ class OwnTerm:
         arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
             terminal
-            for terminal in traverse_unique_terminals(W)
-            if isinstance(terminal, Coefficient | Constant | GeometricQuantity) and terminal not in arguments
+            for terminal in ufl.corealg.traversal.traverse_unique_terminals(W)
+            if isinstance(terminal, ufl.Coefficient | ufl.Constant | ufl.geometry.GeometricQuantity)
+            and terminal not in arguments
         ]
 
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
-        coefficients = extract_coefficients(self._symbolic.W)
+        coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients)
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
@@ -346,7 +354,7 @@ class OwnTerm:
     def _at(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
         return ufl.as_ufl(density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters)))
 
-    def _same(self, *samples: "Sample") -> bool:
+    def _same(self, *samples: Sample) -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
@@ -354,11 +362,12 @@ class OwnTerm:
                 return False
         return True
 
-    def _value(self, sample: "Sample", density: Callable[..., Expr]) -> float:
+    def _value(self, sample: Sample, density: Callable[..., Expr]) -> float:
         """A density at a sample; nan where it has none, as a root of less than zero."""
         r0, u, m = sample
         try:
-            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u), _as_expression(m), density))(()))
+            lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering
+            return float(lowered(self._at(_as_jet(r0), _as_jet(u), _as_expression(m), density))(()))
         except (ArithmeticError, TypeError, ValueError):
             return np.nan
 
@@ -390,7 +399,7 @@ def _as_expression(value: float | Array | Free | GivenField | ByPlace | Coeffici
     if isinstance(value, GivenField):
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
-    if isinstance(value, Coefficient):  # of any value
+    if isinstance(value, ufl.Coefficient):  # of any value
         value = np.arange(1.0, 1 + prod(value.ufl_shape)) if value.ufl_shape not in ((), (1,)) else 1.0
     if isinstance(value, Free):
         return ufl.as_ufl(value.value or 1.0)  # of no place in its range, such as zero, that hides terms

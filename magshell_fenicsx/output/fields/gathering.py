@@ -5,7 +5,7 @@ That of a meridian gives the surface that it sweeps, in flat triangles.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import basix
 import numpy as np
@@ -20,10 +20,12 @@ from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, SurfaceGatherer, grown
-from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.revolution import ENDS, Revolution
-from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.solid import SolidModel
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
+    from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
 
@@ -31,7 +33,7 @@ Array = NDArray[np.float64]
 class RevolvedGatherer:
     """Gathers displacement and fields of a meridian; strains and moments are recovered from samples in its cells."""
 
-    def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
+    def __init__(self, model: "MeridianModel", comm: MPI.Comm) -> None:
         self.comm, self._model = comm, model
         self._inner, rule = basix.make_quadrature(basix.CellType.interval, 2 * model.degree - 3)
         self._swept = Revolution(model)
@@ -106,7 +108,7 @@ class RecoveredMeridian:
     At a pole, where both are even functions of the arc length, the first cell has its mirror image beside it.
     """
 
-    def __init__(self, swept: Revolution, model: MeridianModel, inner: Array, rule: Array) -> None:
+    def __init__(self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array) -> None:
         s = np.sort(model.meridian.mesh.geometry.x[:, 0])
         begin, length = s[:-1, None], np.diff(s)[:, None]
         samples, ends = begin + length * inner[:, 0], swept.ends
@@ -142,7 +144,7 @@ class RecoveredMeridian:
 class BodyGatherer:
     """Gathers the displacement of one solid; n0 is the direction of the thickness."""
 
-    def __init__(self, model: SolidModel) -> None:
+    def __init__(self, model: "SolidModel") -> None:
         self._model, self.comm = model, model.V.mesh.comm
         V = model.V
         cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]
@@ -189,7 +191,7 @@ class Gatherer(Protocol):
         """The displaced nodes with their fields at the amplitudes mu, on rank 0; None on other ranks."""
 
 
-def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:
+def gatherer(model: "ShellModel | MeridianModel | SolidModel", comm: MPI.Comm) -> Gatherer:
     """The gatherer of a model."""
     if model.axisymmetric:
         return RevolvedGatherer(model, comm)

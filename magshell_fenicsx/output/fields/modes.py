@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import pi, sqrt
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,13 @@ from magshell_fenicsx.output.fields.surface import Surface, turned, whole
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import read_csv, table_text
-from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.modes import TORSION
 from magshell_fenicsx.shells.revolution import Revolution
-from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.solid import SolidModel
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
+    from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
 WAVES = "m = "
@@ -43,7 +45,7 @@ class Mode(Protocol):
 
 
 def mode_surface(
-    model: ShellModel | MeridianModel | SolidModel,
+    model: "ShellModel | MeridianModel | SolidModel",
     gatherer: Gatherer,
     u: Vector,
     label: str,
@@ -145,7 +147,7 @@ def _with_mode(base: Surface, v: Array) -> Surface:
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
 
-def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
+def _revolved_wave(model: "MeridianModel", u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
     """The surface with at least twelve sectors per wave, and the wave at its nodes.
 
     v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; of m = 0, torsion, V e_theta.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import basix
 import basix.ufl
@@ -20,7 +20,9 @@ from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
 from magshell_fenicsx.shape.solids import Solid
-from magshell_fenicsx.shells.shell import ShellModel
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.shell import ShellModel
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
@@ -93,7 +95,7 @@ class SurfaceGatherer:
     the mean of the cells that share a node.
     """
 
-    def __init__(self, model: ShellModel) -> None:
+    def __init__(self, model: "ShellModel") -> None:
         self._model = model
         domain, degree = model.V.mesh, model.degree
         self.comm = domain.comm

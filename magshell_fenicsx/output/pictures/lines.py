@@ -185,7 +185,10 @@ def smooth(
     slopes = np.array([_slopes(chord, values, ends) for values in xy])
     for coordinate, end in level:
         slopes[coordinate, end] = 0.0
-    return np.asarray(scipy.interpolate.CubicHermiteSpline(chord, xy, slopes, axis=1)(_fine(chord)))
+    t, h, rise = np.arange(FINE) / FINE, np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
+    first, last = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
+    curve = xy[:, :-1, None] + t * (first + t * (3 * rise - 2 * first - last + t * (first + last - 2 * rise)))
+    return np.concatenate([curve.reshape(2, -1), xy[:, -1:]], axis=1)
 
 
 def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:

@@ -6,13 +6,14 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, TypeVar
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.reading import read_whole
+
+if TYPE_CHECKING:  # a refused case does without
+    from mpi4py import MPI
 
 T = TypeVar("T")
 MOST_NAMED = 6
@@ -102,7 +103,7 @@ def _is_filled(file: Path) -> bool:
     return file.exists() and (not file.is_file() or file.stat().st_size > 0)
 
 
-def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
+def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) -> Path:
     """Let rank 0 prepare a folder; collective.
 
     Raises
@@ -123,7 +124,7 @@ def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> P
 
 
 @contextmanager
-def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
+def held_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     """Lock a folder against other runs inside `with`; ranks of a killed mpirun may still be writing.
 
     Parameters
@@ -162,7 +163,7 @@ def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
 
 
 def by_first(
-    comm: MPI.Comm, do: Callable[[], T], failed: Literal["cannot be written", "cannot be read"] = "cannot be written"
+    comm: "MPI.Comm", do: Callable[[], T], failed: Literal["cannot be written", "cannot be read"] = "cannot be written"
 ) -> T:
     """Let rank 0 write or read; return its result on every rank, see `from_first`. Collective.
 

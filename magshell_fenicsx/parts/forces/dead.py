@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Formula, function, is_formula, symbolic
 from magshell_fenicsx.input.section import Section, in_units, or_number
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
+from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.path_step import Count, PathStep
@@ -26,6 +25,8 @@ from magshell_fenicsx.shape.symmetry import Leaves, alike, mirrors_formula, tilt
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 
 if TYPE_CHECKING:
+    from ufl.core.expr import Expr
+
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
@@ -289,11 +290,11 @@ def _mirrored_formula(load: DeadLoadSection, other: DeadLoadSection, mirror: Mir
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
     """The energy of a load that depends on the deformed place, zero where nothing has moved."""
 
-    def at(r: Expr, scale: Expr, size: Expr) -> Expr:
+    def at(r: "Expr", scale: "Expr", size: "Expr") -> "Expr":
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
-        return size * symbolic(text, SYMBOLIC, *x)
+        return size * symbolic(text, symbolic_functions(), *x)
 
-    def density(r0: Jet, u: Jet, scale: Expr, size: Expr) -> Expr:
+    def density(r0: Jet, u: Jet, scale: "Expr", size: "Expr") -> "Expr":
         return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
 
     return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))

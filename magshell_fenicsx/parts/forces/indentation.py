@@ -53,7 +53,7 @@ class IndentationSection(PathStep):
         "force": Target("load", "force"),
     }
     kind: Literal["indentation"]
-    at: Place = Place()
+    at: Place = Place.model_construct()
     """Where the force is, by default the pole or the centre; on a hemisphere polar is below 89"""
     control: Literal["displacement", "load", "arc"] = "displacement"
     """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is load with a target

@@ -9,6 +9,7 @@ with it, and the triangulation stays.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import basix
 import numpy as np
@@ -30,12 +31,14 @@ from magshell_fenicsx.models.shell.residual import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
-from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms
 from magshell_fenicsx.simulate.transfer import transfer
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
 Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
@@ -182,7 +185,7 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     return slopes[..., None]
 
 
-def _basis_at(model: ShellModel | MeridianModel, f: fem.Function, x: Array) -> tuple[int, Array] | None:
+def _basis_at(model: "ShellModel | MeridianModel", f: fem.Function, x: Array) -> tuple[int, Array] | None:
     """The cell of a place of the surface and its basis functions' values there; None on other ranks; collective.
 
     In the cell it is the nearest place on the plane of the corners.
