@@ -309,11 +309,13 @@ class Problem:
 
 
 def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
-    """Vertices of the meridian's mesh, in the chart."""
+    """Vertices of the meridian's mesh, in the chart; those of several shells one after the other."""
     span = problem.meridian
     assert span
     if span.vertices is not None:
         return span.vertices
+    if span.pieces:
+        return np.concatenate([piece.vertices(problem.pressed) for piece in span.pieces])
     pole = span.names[0] is None
     h = problem.material.h / span.curvature
     reach = max((one[1] for one in problem.pressed), default=0.0)

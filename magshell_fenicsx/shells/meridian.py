@@ -24,12 +24,12 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
-from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import meridian_openings
+from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
@@ -144,16 +144,25 @@ class MeridianModel(Thin):
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         of_place = partial(field_of_place, self.r0)
         loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
+        patches, count = meridian.patches, len(meridian.order)
+        for name in ("magnetic", "remanence"):
+            if given := getattr(loads, name):
+                loads = self.loads = replace(loads, **{name: given.on(patches, count)})
         self.sigma = default_penalty(degree) if sigma is None else sigma
         shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
-        self.thickness = thickness_field(thickness, self.r0) if thickness else None
+        self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
+        self.made_of = None
+        if material.shells:
+            self.made_of = material_field(material.shells, meridian.mesh, patches)
+        pressed = on_cells(loads.pressed, meridian) if loads.pressed else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
-            shape = Shape.of(natural_field(loads.natural, cells_of(self.r0), V), loads.natural, free)
+            loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
+            shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
         carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell)
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, made_of=self.made_of)
         around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
@@ -169,13 +178,13 @@ class MeridianModel(Thin):
             self.energies.append(factory.mirror_edges(self.held.mirror, np.array([0.0, 0.0, 1.0])))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
-        free_ends, self.without_potential = meridian_openings(meridian, conditions)
+        free_ends, self.without_potential = meridian_openings(meridian, conditions, loads.pressed)
         closed = enclosed(loads, free_ends, self.without_potential)
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += self.own_and_contacts(meridian.ends)
         for name, force in loads.forces.items():
-            self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
+            self.energies.append(pole_force(name, force, self.force_unit, around, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
             if forces(dead):
@@ -267,9 +276,8 @@ class MeridianModel(Thin):
     def _pressed(self) -> Pressed:
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
-        first = min(self.meridian.mesh.geometry.x[:, 0])
         lids = [
-            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=s > first)
+            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=not self.meridian.begins(name))
             for name, s in ends.items()
             if (motions := motions_of(self.loads, name))
         ]
