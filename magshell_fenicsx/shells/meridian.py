@@ -33,6 +33,7 @@ from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
+from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching, touchings
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
@@ -117,11 +118,16 @@ class MeridianModel(Thin):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
+    made_of
+        Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
+    touchings
+        The contacts of shells with each other.
     """
+
+    touchings: Sequence[MeridianTouching]
 
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
-    made_of: None = None  # of one material
     multiplicity = 1
     axes: ClassVar[list[int]] = [0, 2]
 
@@ -152,7 +158,7 @@ class MeridianModel(Thin):
         shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
-        self.made_of = None
+        self.made_of: fem.Function | None = None
         if material.shells:
             self.made_of = material_field(material.shells, meridian.mesh, patches)
         pressed = on_cells(loads.pressed, meridian) if loads.pressed else None
@@ -208,8 +214,19 @@ class MeridianModel(Thin):
             parameters |= self.growing.parameters(terms, parameters)
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
+        rule = factory.carrier.contact_rule
+        self.touchings = touchings(loads.pairs, self.r0, self.u, meridian.patches, self.material.h, rule)
+        for each in self.touchings:
+            stiffnesses |= each.history
         self.system = FiniteElementSystem(
-            self.u, terms, held, pattern, self.material.h, parameters=parameters, moving=moves, history=stiffnesses
+            self.u,
+            [*terms, *self.touchings],
+            held,
+            pattern,
+            self.material.h,
+            parameters=parameters,
+            moving=moves,
+            history=stiffnesses,
         )
         self._volume = self.kernels.compile("volume energy", volume)
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
@@ -217,7 +234,7 @@ class MeridianModel(Thin):
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
-        follows = self.growing or self.contacts or self.fields or self.loads.moves
+        follows = self.growing or self.contacts or self.loads.pairs or self.fields or self.loads.moves
         if follows or any(e.density is None or e.counted for e in self.energies):
             return None
         free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
@@ -239,7 +256,8 @@ class MeridianModel(Thin):
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels))
+        of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
+        return ExcludedWaves(Waves(*of, self.touchings))
 
     @property
     def waves(self) -> Waves:

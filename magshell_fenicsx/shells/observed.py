@@ -28,6 +28,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
+from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.shells.terms import EnergyFactory
 
@@ -85,7 +86,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
-    touchings: Sequence[Touching] = ()
+    touchings: Sequence[Touching] | Sequence[MeridianTouching] = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None
