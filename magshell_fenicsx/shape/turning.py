@@ -43,6 +43,11 @@ class Piece:
     place: Callable[[Array], tuple[float, float]]
     vertices: Callable[[Sequence[tuple[float, float]]], Array]
 
+    @property
+    def length(self) -> float:
+        """Of its parameter."""
+        return self.ends[1] - self.ends[0]
+
 
 @dataclass(frozen=True)
 class Span:

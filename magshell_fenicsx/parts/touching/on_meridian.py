@@ -154,8 +154,8 @@ class MeridianTouching:
     def entries(self) -> Entries:
         """See `Coupled`."""
         H, nodes = self._second(0.0)
-        plane = H.reshape(len(H), -1, 3, H.shape[1] // 3, 3)[:, :, ::2][..., ::2]
-        return _entries(plane.reshape(len(H), 2 * nodes.shape[1], -1), nodes, 2)
+        of_plane = np.flatnonzero(np.arange(H.shape[1]) % 3 != 1)
+        return _entries(H[:, of_plane[:, None], of_plane], nodes, 2)
 
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
@@ -352,11 +352,10 @@ class MeridianTouching:
     def _geometry(self, at: Faced) -> tuple[Array, Array, Array, Longs]:
         """x - y, n, and beta (n, functions of both cells) with its nodes."""
         nodes = np.concatenate([self._nodes[self._rule.cell[at.point]], self._nodes[at.cell]], axis=1)
-        r, half = self._r0 + self._at, nodes.shape[1] // 2
+        r = self._r0 + self._at
         N, shape = self._rule.shape[at.point], self._table(0, at.X)[0]
         beta = np.concatenate([N, -shape], axis=1)
         off = np.einsum("nk,nki->ni", beta, r[nodes])
-        assert half
         return off, off / np.linalg.norm(off, axis=1)[:, None], beta, nodes
 
     def _second(self, m: float) -> tuple[Array, Longs]:
@@ -382,7 +381,7 @@ class MeridianTouching:
         A = np.sum(along * along - off * curved, axis=1)
         B = y[:, 0] * (y[:, 0] + off[:, 0])
         inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
-        rows = np.stack([each.reshape(count, -1) for each in (normal, slide, turn)], axis=1)
+        rows = np.stack([each.reshape(count, 3 * functions) for each in (normal, slide, turn)], axis=1)
         factors = np.column_stack([weight * second - bent, -bent * inverse[0], -bent * inverse[1]])
         H = np.einsum("nar,na,nas->nrs", rows, factors, rows)
         both = bent[:, None, None] * beta[:, :, None] * beta[:, None]
