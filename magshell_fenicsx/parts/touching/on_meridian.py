@@ -160,10 +160,9 @@ class MeridianTouching:
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
         H, nodes = self._second(m)
-        by_coefficients = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # U = P - V
-        split = H.reshape(len(H), nodes.shape[1], 3, nodes.shape[1], 3)
-        split = np.einsum("ia,nkilj,jb->nkalb", by_coefficients, split, by_coefficients)
-        return _entries(split.reshape(H.shape) / 2, nodes, 3)
+        H[:, 1::3] -= H[:, ::3]  # with P = U + V, U is P - V
+        H[..., 1::3] -= H[..., ::3]
+        return _entries(H / 2, nodes, 3)
 
     # what is seen
 
@@ -270,7 +269,11 @@ class MeridianTouching:
         radii = BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
         parts = list[tuple[Longs, Longs]]()
         for mine, others in zip((rule.first, ~rule.first), self._sides[::-1], strict=True):
-            points, cells = np.flatnonzero(mine), np.flatnonzero(others)
+            near, cells = np.unique(rule.cell[mine]), np.flatnonzero(others)
+            far = np.linalg.norm(centres[near][:, None] - centres[cells], axis=2) - radii[cells] - reach
+            within = np.zeros(len(nodal), dtype=bool)
+            within[near] = (far < radii[near][:, None]).any(axis=1)
+            points, cells = np.flatnonzero(mine & within[rule.cell]), cells[(far < radii[near][:, None]).any(axis=0)]
             away = np.linalg.norm(x[points][:, None] - centres[cells], axis=2)
             i, j = np.nonzero(away < radii[cells] + reach)
             parts.append((points[i], cells[j]))
@@ -383,7 +386,7 @@ class MeridianTouching:
         inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
         rows = np.stack([each.reshape(count, 3 * functions) for each in (normal, slide, turn)], axis=1)
         factors = np.column_stack([weight * second - bent, -bent * inverse[0], -bent * inverse[1]])
-        H = np.einsum("nar,na,nas->nrs", rows, factors, rows)
+        H = rows.transpose(0, 2, 1) @ (factors[..., None] * rows)
         both = bent[:, None, None] * beta[:, :, None] * beta[:, None]
         for i in range(3):
             H[:, i::3, i::3] += both
