@@ -100,7 +100,9 @@ class Meridian:
         return np.sort(self.mesh.geometry.x[compat.corner_numbers(self.mesh), 0], axis=1)
 
     def _at(self, facets: NDArray[np.int32]) -> Array:
-        """Parameters of facets."""
+        """Parameters of facets, of which dolfinx wants one at least."""
+        if not len(facets):
+            return np.empty(0)
         return np.asarray(self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, facets).ravel(), 0])
 
     def section(self, s: Array) -> Array:

@@ -192,9 +192,9 @@ class MeridianTouching:
         deep = self._h - at.distance
         if len(deep) and deep.max() > WITHIN * self._h:
             rho, z = self._x_of(self._r0)[at.point[int(deep.argmax())]]
-            where = f"{rho:.4g}, 0, {z:.4g}"
+            where, by = f"{rho:.4g}, 0, {z:.4g}", deep.max() / h
             raise MeshError(
-                f"contact: {self.pair.words} overlap undeformed, by {deep.max() / h:.4g} h at ({where}) R: move them apart"
+                f"contact: {self.pair.words} overlap undeformed, by {by:.4g} h at ({where}) R: move them apart"
             )
 
     def of_cells(self) -> tuple[Array, Array]:
