@@ -22,7 +22,7 @@ from magshell_fenicsx.simulate.record import Stopped
 
 Array = NDArray[np.float64]
 h, WIDTH, CELLS = 0.03, 0.25, 8  # thickness, width and cells along a sheet of unit length
-PARTS = 4  # of a cell's side, for the test of triangles
+PARTS = 8  # of a cell's side, for the test of triangles
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,8 @@ class MeridianModel(Thin):
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
-        follows = self.growing or self.contacts or self.loads.pairs or self.fields or self.loads.moves
+        touched = self.contacts or self.loads.pairs
+        follows = self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
         if follows or any(e.density is None or e.counted for e in self.energies):
             return None
         free = {id(constant) for constant in self.factory.free.values()}  # amplitudes

@@ -109,7 +109,7 @@ class SolidModel(Observed):
             shape = body_shape(loads.natural, body, V, free)
             growing["grown"] = lambda density: grown_in_body(density, shape)
         self.factory = factory = TermFactory(
-            body, self.u, law, material.h, self.kernels, hinged, free=free, fields=[], **growing
+            body, self.u, law, material.h, self.kernels, hinged, free=free, fields=[], saturated=[], **growing
         )
         self._pattern, *areal = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)

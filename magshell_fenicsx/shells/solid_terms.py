@@ -11,6 +11,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.following import PointField, at_quadrature
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, WHOLE, Body, face_measure
@@ -31,6 +32,7 @@ from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 
 REDUCED = 3  # quadrature degree: two points in each direction
@@ -101,6 +103,7 @@ class TermFactory:
     grown: Callable[[Density], Density] = lambda density: density  # takes the body's natural shape
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
+    saturated: list[PointField] = field(default_factory=list)  # of a soft material, when it was made
 
     def distortions(self) -> list[SolidTerm]:
         """What does not depend on a change of volume; of a neo-Hookean body one term."""
@@ -136,8 +139,8 @@ class TermFactory:
     def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
-        chi, n0, *given = self._of_sheet(sheet, soft, applied)
-        density = Density(sheet.of_body, (chi, scale, n0, h, *given), VALUE + GRADIENT)
+        law, n0, *given = self._of_sheet(sheet, soft, applied)
+        density = Density(sheet.of_body, (law, scale, n0, h, *given), VALUE + GRADIENT)
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
@@ -145,16 +148,16 @@ class TermFactory:
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
-        chi, n0, *given = self._of_sheet(sheet, field.soft, applied)
+        law, n0, *given = self._of_sheet(sheet, field.soft, applied)
         densities = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            densities[axis] = Density(sheet.induced_in_body, (chi, *self._constants(e), n0, *given))
+            densities[axis] = Density(sheet.induced_in_body, (law, *self._constants(e), n0, *given))
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
     def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> "list[fem.Constant | fem.Function]":
-        """The susceptibility, the normals of layers, the amplitudes, and the parts of the field."""
+        """The susceptibility, or what is known of what saturates; normals of layers, amplitudes, parts of the field."""
         chi, V = soft.susceptibility, self.u.function_space
-        of_place = (
+        law = (
             field_in_body(chi, V, name="susceptibility", key="magnetic.susceptibility", size=1)
             if callable(chi)
             else self._constants(chi)[0]
@@ -162,7 +165,35 @@ class TermFactory:
         n0 = field_in_body(radial, V, name="n0")
         amplitudes = [self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes]
         polynomials = [applied.polynomial] if applied else []
-        return [of_place, n0, *amplitudes, *self._constants(*sheet.vectors), *polynomials]
+        if soft.saturation is not None:
+            if not self.saturated:  # energy and observed forms share it
+                self.saturated.append(self._saturated(sheet, law, n0, amplitudes, applied))
+            law = self.saturated[0]
+        return [law, n0, *amplitudes, *self._constants(*sheet.vectors), *polynomials]
+
+    def _saturated(
+        self,
+        sheet: Sheet,
+        chi: fem.Constant | fem.Function,
+        n0: fem.Function,
+        amplitudes: Sequence[fem.Constant],
+        applied: AppliedField | None,
+    ) -> PointField:
+        """What is known of a material that saturates, at the points of cells."""
+        V = self.u.function_space
+        known, X = PointField(V.mesh, WHOLE, 2 * SIZE), fem.Function(V)
+        X.interpolate(lambda x: x)
+        table, followed = V.element.basix_element.tabulate(1, known.points)[..., 0], (X, self.u)
+        before = at_quadrature(n0, known.points)
+
+        def placed() -> list[Array]:
+            x0, u = (np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list]) for f in followed)
+            G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (x0, u))
+            F = np.eye(3) + H @ np.linalg.inv(G)
+            n = np.linalg.solve(np.swapaxes(F, -1, -2), before[..., None])[..., 0]  # cof F n0, but for its length
+            return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), before]
+
+        return sheet.saturated(chi, amplitudes, applied, known, followed, placed)
 
     def remanent(self, of: Magnetisation, field: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""

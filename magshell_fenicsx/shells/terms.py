@@ -10,6 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets, HeldEdge
@@ -46,6 +47,7 @@ from magshell_fenicsx.parts.loads import moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
@@ -78,6 +80,8 @@ class EnergyFactory:
         Joints with springs or hinges.
     made_of
         Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
+    saturated
+        What is known of a soft material that saturates, when it was made.
     """
 
     carrier: Carrier
@@ -94,6 +98,7 @@ class EnergyFactory:
     pressed: fem.Function | None = None
     creases: Creases | None = None
     made_of: fem.Function | None = None
+    saturated: list[PointField] = field(default_factory=list)
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
@@ -192,9 +197,9 @@ class EnergyFactory:
     def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
         sheet, scale = Sheet(field), self._constant(soft.scale)
-        chi, *given = self._of_sheet(sheet, soft, applied)
+        law, *given = self._of_sheet(sheet, soft, applied)
         parts = FIRST if field.uniform else MOVED
-        density = Density(per_area(sheet.of_surface), (chi, scale, *given), parts=parts)
+        density = Density(per_area(sheet.of_surface), (law, scale, *given), parts=parts)
         return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
@@ -202,22 +207,41 @@ class EnergyFactory:
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
-        chi, *given = self._of_sheet(sheet, field.soft, applied)
+        law, *given = self._of_sheet(sheet, field.soft, applied)
         by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            by_name[axis] = Density(per_area(sheet.induced), (chi, self._constant(e), *given))
+            by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *given))
         return {f"induced {name}": self._over_area(self._thick(density)) for name, density in by_name.items()}
 
     def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> list[Parameter]:
-        """The susceptibility, the amplitudes, and the parts of the field."""
+        """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of the field."""
         chi = soft.susceptibility
-        of_place = (
+        law = (
             pattern_field(chi, self.carrier.r0, name="susceptibility", key="magnetic.susceptibility", size=1)[0]
             if callable(chi)
             else self._constant(chi)
         )
         amplitudes = [self.free.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes]
-        return [of_place, *amplitudes, *map(self._constant, sheet.vectors), *([applied.polynomial] if applied else [])]
+        if soft.saturation is not None:
+            if not self.saturated:  # energy and observed forms share it
+                self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
+            law = self.saturated[0]
+        return [law, *amplitudes, *map(self._constant, sheet.vectors), *([applied.polynomial] if applied else [])]
+
+    def _saturated(
+        self, sheet: Sheet, chi: Parameter, amplitudes: Sequence[fem.Constant], applied: AppliedField | None
+    ) -> PointField:
+        """What is known of a material that saturates, at the points of cells."""
+        carrier, followed = self.carrier, (self.carrier.r0, self.u)
+        known = PointField(carrier.mesh, carrier.rule, 2 * SIZE)
+        jets = carrier.tables(carrier.r0.function_space, known.points)
+
+        def placed() -> list[Array]:
+            r0, u = (jets(f.x.array)[:3] for f in followed)
+            areas = [np.cross(r[1], r[2]) for r in (r0 + u, r0)]
+            return [r0[0], u[0], *(m / np.linalg.norm(m, axis=-1, keepdims=True) for m in areas)]
+
+        return sheet.saturated(chi, amplitudes, applied, known, followed, placed)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""

@@ -25,8 +25,8 @@ def key_words(key: str, unit: str = "") -> str:
     ('applied flux density', 'radius over thickness  $R/h$')
     >>> key_words("shell.defect.amplitude"), key_words("shell.defect.amplitude", "mm"), key_words("loading.0.factor")
     ('amplitude over $h$', 'amplitude', 'factor of step 1')
-    >>> key_words("magnetic.applied.sources.0.position.2")
-    'position z'
+    >>> key_words("magnetic.applied.sources.0.position.2"), key_words("shell.polar")
+    ('position z', 'polar angle of shell')
     """
     name = short(key)
     if name in NAMES:
@@ -35,6 +35,8 @@ def key_words(key: str, unit: str = "") -> str:
         return "amplitude over $h$"
     *_, parent, last = ("", *key.split("."))
     words = f"{parent} {last}" if last == "flux_density" or last.isdigit() else name
+    if last in UNITS:
+        words = f"{last} angle of {parent}" if parent else f"{last} angle"
     words = re.sub(r"^position ([012])$", lambda axis: f"position {'xyz'[int(axis[1])]}", words)
     step = re.match(r"loading\.(\d+)\.", key)
     return words.replace("_", " ") + (f" of step {int(step[1]) + 1}" if step else "")

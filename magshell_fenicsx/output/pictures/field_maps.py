@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 MOST = 6  # maps in the picture
 LEAST, DECADES = 10.0, 3.0  # ratio of the sizes from which colours are logarithms, and how many powers of ten
 FLAT = 1e-6  # of |B|: a part in the plane as small as this has no lines
-MARGIN, BODY, TALLEST = 0.22, 0.68, 2.0  # of a panel's width: what is around its map, and how wide and tall that is
+MARGIN = 1.5  # inches of a panel above and below its map: title, axis, colours
+BODY, TALLEST = 0.78, 2.0  # of a panel's width: how wide and tall its map is
 PARALLEL = 1 - 1e-12
 ON_PLANE = 1e-9  # over R
 DENSITY = 1.2  # of lines
@@ -53,7 +54,7 @@ def field_maps_figure(
     high, wide = -(-len(shown) // across), (style.width or (ONE if across == 1 else SEVERAL)) / INCH
     with drawing(style):
         ratio = max(float(np.linalg.norm(grid.sides[1]) / np.linalg.norm(grid.sides[0])) for grid, _ in shown)
-        tall = (MARGIN + BODY * min(ratio, TALLEST)) * wide / across
+        tall = MARGIN + BODY * min(ratio, TALLEST) * wide / across
         figure = Figure(figsize=(wide, tall * high), dpi=style.dpi, layout="constrained")
         grid_of_axes = figure.subplots(high, across, squeeze=False).ravel()
         for axes, (grid, R) in zip(grid_of_axes, shown, strict=False):
@@ -119,10 +120,10 @@ def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: 
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.set(xlabel=_direction(units[0], R), ylabel=_direction(units[1], R))
-    axes.set_title(f"{grid.name.replace('_', ' ')}: {grid.words} field{_place(grid, units, length, R)}")
-    axes.figure.colorbar(image, ax=axes, label=f"$|B|$  {unit}", fraction=0.05)
+    axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{_place(grid, units, length, R)}")
+    bar = axes.figure.colorbar(image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05)
     if not wide:
-        axes.figure.axes[-1].yaxis.set_major_formatter(number_format())
+        bar.ax.xaxis.set_major_formatter(number_format())
     flat = np.stack([lines @ e for e in units], axis=-1)
     along_line = flat[:, 1] - flat[:, 0]
     across = np.stack([-along_line[:, 1], along_line[:, 0]], axis=-1)

@@ -4,16 +4,18 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
+import basix
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.hexahedra import WHOLE
 from magshell_fenicsx.mesh.mirror import Image, rotation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape, unit
 from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
@@ -255,13 +257,54 @@ class OwnField:
         return sign
 
     def _parity(self, pattern: Callable[[Array, Array], Array]) -> float:
-        mirror = self._sight.mirror
-        if mirror is None:
-            return 1.0
         x, n = (each[: self._owned] for each in places(self._model.r0))
-        S = mirror.reflection
-        images = pattern(mirror.image(x), n @ S) @ S
-        return float(np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
+        return _parity(pattern, x, n, self._sight)
+
+
+def _parity(pattern: Callable[[Array, Array], Array], x: Array, n: Array, sight: Sight) -> float:
+    """1 if the mirror images of a remanence continue it, -1 if their opposites do; collective."""
+    if sight.mirror is None:
+        return 1.0
+    S = sight.mirror.reflection
+    images = pattern(sight.mirror.image(x), n @ S) @ S
+    return float(np.sign(sight.model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
+
+
+def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
+    """The integral of the remanence and of what a field induces, as the shell carries them, (3,) over R³; collective.
+
+    In the frame of the model, at the displacement that its system has.
+    """
+    if sight.model.r0.function_space.mesh.topology.dim < 3:
+        own = own_field(sight)
+        return own.moment(own.families(mu)[1], mu)
+    return _moment_of_body(sight, mu)
+
+
+def _moment_of_body(sight: Sight, mu: Mapping[str, float]) -> Array:
+    """The same of a solid, whose polarisation per undeformed volume is F Br or R Br, and what is induced."""
+    model, of, V = sight.model, magnetised(sight.loads), sight.model.r0.function_space
+    assert of
+    points, weights = basix.make_quadrature(V.mesh.basix_cell(), WHOLE)
+    T, owned = V.element.basix_element.tabulate(1, points)[..., 0], V.mesh.topology.index_map(3).size_local
+    X, u = (np.einsum("dqk,cki->dcqi", T, f.x.array.reshape(-1, 3)[V.dofmap.list]) for f in (model.r0, model.system.u))
+    G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
+    F, n0 = np.eye(3) + H @ np.linalg.inv(G), unit(np.cross(X[1], X[2]))
+    pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
+    J, sign = np.zeros_like(n0), 0.0
+    if not (of.soft and of.soft.alone):
+        U, _, W = np.linalg.svd(F)
+        J = np.einsum("cqij,cqj->cqi", F if of.law == "deformation" else U @ W, pattern(X[0], n0))
+        sign = _parity(pattern, X[0], n0, sight)
+    if of.soft:
+        n = unit(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None])[..., 0])
+        J = J + of.soft.scale**2 * of.soft.polarisation(X[0], n0, n, of.at(mu, X[0] + u[0]))
+    volume = np.abs(np.linalg.det(G)) * weights
+    total = np.asarray(model.system.comm.allreduce(np.einsum("cq,cqi->i", volume[:owned], J[:owned])))
+    if sight.mirror is None:
+        return total
+    shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
+    return sight.mirror.summed(total, sign or of.sign_of_images(shown, model.r0, sight.mirror))
 
 
 def own_field(sight: Sight) -> OwnField:

@@ -39,7 +39,7 @@ register(
 
 
 class FieldSeen(Seen):
-    """How strong the field is and how far it has turned, columns of every run."""
+    """How strong the field is and how far it has turned, columns of every run; and the moment of what is magnetised."""
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return ()
@@ -52,6 +52,18 @@ class FieldSeen(Seen):
 
         angle = field_angle(state.mu, sight.loads.magnetic, sight.sense)
         return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
+
+    def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
+        from magshell_fenicsx.parts.magnetism.own_field import magnetic_moment, magnetised
+
+        of = magnetised(sight.loads)
+        if of is None:
+            return {}
+        at = sight.model.system.at(state)
+        moment = at.of(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)
+        size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
+        unit = "√(E/μ0) R³" if of.soft and of.soft.alone else "|Br| R³/μ0"
+        return {"magnetic_moment": {"value": (size * moment).tolist(), "unit": "A m²" if of.metres else unit}}
 
 
 class SoftSeen(Seen):
@@ -110,17 +122,6 @@ class SensorsSeen(Seen):
         readings = self._readings(sight, state, sight.loads.sensors)
         columns = [column for each in sight.loads.sensors for column in each.columns]
         return dict(zip(columns, map(float, readings.ravel()), strict=True))
-
-    def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
-        from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
-
-        of = magnetised(sight.loads)
-        if of is None or not sight.loads.sensors:
-            return {}
-        own, at = own_field(sight), sight.model.system.at(state)
-        moment = at.of(lambda: own.moment(own.families(state.mu)[1], state.mu)) @ rotation(sight.azimuth)
-        size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
-        return {"magnetic_moment": {"value": (size * moment).tolist(), "unit": "A m²" if of.metres else "|Br| R³/μ0"}}
 
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State

@@ -5,13 +5,7 @@ mu0 M = chi (B_t + B_n n/(1 + chi)) and, per area, the energy -h M.B/2. Over E h
 (lambda_m is the size of the applied field in them), it is -chi/2 (s B)² with s = sqrt(mu0 E)/|Br|. A shell without
 remanence has sqrt(mu0 E) in place of |Br|. The field of other places of the shell is left out.
 
-With a saturation J the material follows Langevin's law, mu0 M = J L(3 chi b/J) along b = mu0 H, L(x) = coth x - 1/x,
-with the coenergy w = J²/(3 chi) ln (sinh x/x), x = 3 chi b/J. Along the sheet b is B; across it is the number for which
-
-    e(B) = max over b_n of -w(|(B_t, b_n)|) - (B_n - b_n)²/2,
-
-that is B_n = b_n + mu0 M_n. Newton's method finds it from b_n = B_n/(1 + chi), from below, in steps (`STEPS`) that are
-part of the density.
+With a saturation J the material follows Langevin's law: `saturation.py`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,22 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import ufl
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.densities import around
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.parts.magnetism import saturation
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.patterns import Pattern
+    from magshell_fenicsx.parts.magnetism.applied import AppliedField
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 
 Array = NDArray[np.float64]
 TERM = "soft magnetism"
-STEPS = ((5.0, 3), (20.0, 4), (100.0, 5), (np.inf, 6))  # largest susceptibility, and Newton's steps for 1e-6
-TINY = 1e-30  # where there is no field
-SMALL = 0.04  # x² below which a series is exact to rounding
 
 
 @dataclass(frozen=True)
@@ -66,12 +61,6 @@ class Soft:
     patches: Mapping[str, Array] | None = None
     saturation: float | None = None
 
-    @property
-    def steps(self) -> int:
-        """Of Newton's method for the field across the sheet."""
-        chi = self.susceptibility
-        return STEPS[-1][1] if callable(chi) else next(steps for most, steps in STEPS if chi <= most)
-
     def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "Soft":
         """With a pattern in place of patches."""
         return replace(self, susceptibility=carried(self.patches), patches=None) if self.patches else self
@@ -87,10 +76,7 @@ class Soft:
         across = np.sum(n * B, axis=-1, keepdims=True)
         if self.saturation is None:
             return np.asarray(chi * (B - chi / (1 + chi) * across * n))
-        along = B - across * n
-        b = _across(chi, across, np.sum(along * along, axis=-1, keepdims=True), self.saturation, self.steps, _ratio)
-        y = (3 * chi / self.saturation) ** 2 * (np.sum(along * along, axis=-1, keepdims=True) + b**2)
-        return np.asarray(chi * _ratio(y) * (along + b * n))
+        return saturation.polarisation(chi, B - across * n, across, n, self.saturation)
 
 
 @dataclass(frozen=True)
@@ -131,94 +117,96 @@ class Sheet:
         G = numbers[0] * parts[-1]
         return B + ufl.dot(G, x0 + u), B + ufl.dot(G, x0)
 
-    def of_surface(self, r0: Jet, u: Jet, chi: Expr, s: Expr, *given: Expr) -> Expr:
-        """The energy over E h per area, without its value at u = 0 in this field."""
-        B, B0 = self.fields(r0.r, u.r, given)
-        return self.of_field(chi, s, B, kin.normal(r0 + u)) - self.of_field(chi, s, B0, kin.normal(r0))
+    def saturated(
+        self,
+        chi: fem.Constant | fem.Function,
+        amplitudes: Sequence[fem.Constant],
+        applied: "AppliedField | None",
+        field: PointField,
+        follows: Sequence[fem.Function],
+        placed: Callable[[], Sequence[Array]],
+    ) -> PointField:
+        """Let a field have what is known of the material at u and at u = 0.
 
-    def induced(self, r0: Jet, u: Jet, chi: Expr, e: Expr, *given: Expr) -> Expr:
+        Parameters
+        ----------
+        follows
+            Placement and displacement.
+        placed
+            Gives x0, u, n and n0 (cells, points, 3) at the points of the field.
+        """
+        assert self.saturation is not None
+
+        def present() -> list[tuple[Array, Array]]:
+            x0, u, n, n0 = placed()
+            values = applied.polynomial.values if applied else None
+            return list(zip(self._known(amplitudes, values, x0, u), (n, n0), strict=True))
+
+        def by() -> tuple[Any, ...]:
+            renewed = [applied.polynomial.renew()] if applied else []
+            return *(f.x.array for f in follows), *(a.value for a in amplitudes), *renewed
+
+        return saturation.point_field(field, chi, self.saturation, present, by)
+
+    def _known(self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array) -> list[Array]:
+        """Both fields (cells, points, 3) at points, as `fields`."""
+        numbers = [float(each.value) for each in amplitudes]
+        if polynomials is not None:
+            return [numbers[0] * polynomials[..., 6:9], numbers[0] * polynomials[..., 3:6]]
+        parts = [self.field.applied, *self.field.across]
+        B = sum((number * part for number, part in zip(numbers, parts, strict=True)), np.zeros(3))
+        G = np.zeros((3, 3)) if self.field.gradient is None else numbers[0] * self.field.gradient
+        return [B + x @ G.T for x in (x0 + u, x0)]
+
+    def of_surface(self, r0: Jet, u: Jet, law: Expr, s: Expr, *given: Expr) -> Expr:
+        """The energy over E h per area, without its value at u = 0 in this field.
+
+        `law` is the susceptibility or, of what saturates, the polynomials at u and at u = 0.
+        """
+        (B, B0), (present, at_first) = self.fields(r0.r, u.r, given), self._halves(law)
+        return s**2 * (self.of_field(present, B, kin.normal(r0 + u)) - self.of_field(at_first, B0, kin.normal(r0)))
+
+    def induced(self, r0: Jet, u: Jet, law: Expr, e: Expr, *given: Expr) -> Expr:
         """The polarisation along a vector, in the unit of lambda_m."""
         B, _ = self.fields(r0.r, u.r, given)
-        return ufl.dot(e, self.polarisation(chi, B, kin.normal(r0 + u)))
+        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, kin.normal(r0 + u)))
 
-    def of_body(self, X: Expr, u: Expr, H: Expr, chi: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr) -> Expr:
+    def of_body(self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr) -> Expr:
         """The same of a body, in units of E h R²: its layers are sheets, with the normal n0 before."""
-        B, B0 = self.fields(X, u, given)
-        return (self.of_field(chi, s, B, across(H, n0)) - self.of_field(chi, s, B0, n0)) / h
+        (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
+        return s**2 * (self.of_field(present, B, across(H, n0)) - self.of_field(at_first, B0, n0)) / h
 
-    def induced_in_body(self, X: Expr, u: Expr, H: Expr, chi: Expr, e: Expr, n0: Expr, *given: Expr) -> Expr:
+    def induced_in_body(self, X: Expr, u: Expr, H: Expr, law: Expr, e: Expr, n0: Expr, *given: Expr) -> Expr:
         """As `induced`."""
         B, _ = self.fields(X, u, given)
-        return ufl.dot(e, self.polarisation(chi, B, across(H, n0)))
+        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, across(H, n0)))
 
-    def polarisation(self, chi: Expr, B: Expr, n: Expr) -> Expr:
+    def polarisation(self, law: Any, B: Expr, n: Expr) -> Expr:
         """mu0 M, that of a linear material chi (B_t + B_n n/(1 + chi))."""
-        chi, largest, normal = number(chi), self._saturation, ufl.dot(B, n)
-        if largest is None:
-            return chi * (B - chi / (1 + chi) * normal * n)
-        along = B - normal * n
-        b = self._across(chi, normal, ufl.dot(along, along))
-        return chi * _ratio_of((3 * chi / largest) ** 2 * (ufl.dot(along, along) + b**2)) * (along + b * n)
+        normal = ufl.dot(B, n)
+        if self.saturation is not None:
+            return saturation.induced(law, B, normal, n)
+        return law * (B - law / (1 + law) * normal * n)
 
-    def of_field(self, chi: Expr, s: Expr, B: Expr, n: Expr) -> Expr:
-        """The energy over E h, that of a linear material -s² mu0 M.B/2."""
-        chi, largest, normal = number(chi), self._saturation, ufl.dot(B, n)
-        if largest is None:
-            return -(s**2) / 2 * ufl.dot(B, self.polarisation(chi, B, n))
-        squared = ufl.dot(B, B) - normal**2
-        b = self._across(chi, normal, squared)
-        field = squared + b**2
-        return -(s**2) / 2 * (chi * field * _coenergy((3 * chi / largest) ** 2 * field) + (normal - b) ** 2)
+    def of_field(self, law: Any, B: Expr, n: Expr) -> Expr:
+        """The energy over E h and s², that of a linear material -mu0 M.B/2."""
+        if self.saturation is None:
+            return -ufl.dot(B, self.polarisation(law, B, n)) / 2
+        normal = ufl.dot(B, n) ** 2
+        return saturation.energy(law, normal, ufl.dot(B, B) - normal)
 
-    def _across(self, chi: Expr, normal: Expr, along: Expr) -> Expr:
-        assert self.field.soft
-        assert self._saturation
-        return _across(chi, normal, along, self._saturation, self.field.soft.steps, _ratio_of)
+    def _halves(self, law: Expr) -> tuple[Any, Any]:
+        """What is known of the material at u and at u = 0."""
+        if self.saturation is None:
+            chi = law[0] if law.ufl_shape else law  # a field (1,), or a constant
+            return chi, chi
+        size = saturation.SIZE
+        return [law[i] for i in range(size)], [law[size + i] for i in range(size)]
 
     @property
-    def _saturation(self) -> float | None:
+    def saturation(self) -> float | None:
+        """Of what is soft."""
         return self.field.soft.saturation if self.field.soft else None
-
-
-def number(chi: Expr) -> Expr:
-    """A susceptibility, that is a constant or a field (1,)."""
-    return chi[0] if chi.ufl_shape else chi
-
-
-def _across(chi: Any, normal: Any, along: Any, largest: float, steps: int, ratio: Callable[[Any], Any]) -> Any:
-    """b_n, from B_n and |B_t|², see above; `ratio` is 3 L(x)/x of x², whose slope is 3 (1 - k) - x² k²/3 over 2 x²."""
-    scale, b = (3 * chi / largest) ** 2, normal / (1 + chi)
-    for _ in range(steps):
-        y = scale * (along + b**2)
-        k = ratio(y)
-        slope = k + (3 * (1 - k) - y * k**2 / 3) * b**2 / (along + b**2 + TINY)
-        b = b + (normal - b - chi * b * k) / (1 + chi * slope)
-    return b
-
-
-def _ratio(y: Array) -> Array:
-    x = np.sqrt(np.maximum(y, SMALL))
-    return np.asarray(np.where(y < SMALL, _series(y)[1], 3 * (x / np.tanh(x) - 1) / x**2))
-
-
-def _ratio_of(y: Expr) -> Expr:
-    """The same of an expression."""
-    small = ufl.lt(y, SMALL)
-    x = ufl.sqrt(ufl.conditional(small, SMALL, y))
-    return ufl.conditional(small, _series(y)[1], 3 * (x * (1 + 2 / (ufl.exp(2 * x) - 1)) - 1) / x**2)
-
-
-def _coenergy(y: Expr) -> Expr:
-    """6 ln (sinh x/x)/x² of x²."""
-    small = ufl.lt(y, SMALL)
-    x = ufl.sqrt(ufl.conditional(small, SMALL, y))
-    return ufl.conditional(small, _series(y)[0], 6 * (x + ufl.ln((1 - ufl.exp(-2 * x)) / (2 * x))) / x**2)
-
-
-def _series(y: Any) -> tuple[Any, Any]:
-    """Of both near zero."""
-    w = 1 - y * (1 / 30 - y * (2 / 945 - y * (1 / 6300 - y * 2 / 155925)))
-    return w, 1 - y * (1 / 15 - y * (2 / 315 - y * (1 / 1575 - y * 2 / 31185)))
 
 
 def across(H: Expr, n0: Expr) -> Expr:

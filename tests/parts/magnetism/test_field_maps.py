@@ -1,5 +1,6 @@
 """Maps of the field: the sensors' values and magpylib's at their places, files, picture and what is refused."""
 
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -84,9 +85,14 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     lines = section(surface, level)
     np.testing.assert_allclose(np.linalg.norm(lines[..., :2], axis=-1), np.sqrt(1 - 0.81), atol=5e-3)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * np.pi * 0.19**0.5, rel=5e-3)
-    figure = field_maps_figure([(box, R), (across, R)], surface, about.h, run.resolved, run.style)
+    figure = field_maps_figure([(box, R), (across, R), (box, R)], surface, about.h, run.resolved, run.style)
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:2] == ["box: total field, $z$ = 17 mm", "across: own field, $y$ = 0 mm"]
+    assert titles[:2] == ["box\ntotal field, $z$ = 17 mm", "across\nown field, $y$ = 0 mm"]
+    figure.draw_without_rendering()
+    texts = [text for axes in figure.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label)]
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    assert all(figure.bbox.count_contains(box.corners()) == 4 for box in boxes)
     assert "field_maps_0001.png" in plot(out, 1)
     (out / "fields" / f"map_across_{points - 1:04d}.vtu").unlink()  # that point is written again if a run goes on
     assert FieldSeries(out / "fields", about, "", run.rows, ["box", "across"]).kept == points - 1

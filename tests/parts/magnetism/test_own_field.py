@@ -310,7 +310,7 @@ def test_export_to_magpylib() -> None:
     np.testing.assert_allclose(B[1], read, atol=3e-3 * abs(read[2]))
     np.testing.assert_allclose((4 * B[1] - B[0]) / 3, read, atol=1e-4 * abs(read[2]))
     np.testing.assert_allclose(magpylib.getH(fine, place), B[1] / (4e-7 * np.pi), rtol=1e-9)
-    (said,) = (room.summary(here.sight, here.unloaded()) for room in SEEN if room.differentiable(here.model.loads))
+    (said,) = (found for room in SEEN if (found := room.summary(here.sight, here.unloaded())))
     volume = 2 * np.pi * (1 - np.sqrt(0.5)) * ((20.5 * MM) ** 3 - (19.5 * MM) ** 3) / 3
     assert said["magnetic_moment"]["value"][2] == pytest.approx(0.06 * volume / (4e-7 * np.pi), rel=1e-8)
 
@@ -367,3 +367,43 @@ def test_units_of_sensors_and_what_they_are_called() -> None:
     case["points"] = {"edge": [0.5, 0, "1 mm"]}
     with pytest.raises(ValueError, match=r"points\.edge\.2: has a unit"):
         Case.model_validate(case)
+
+
+def moment_and_tip(case: Case) -> tuple[np.ndarray, dict[str, float]]:
+    """A m² at the end of the path, and its row."""
+    scene = Scene(case.problem())
+    *_, last = follow(scene)
+    (found,) = (said for room in SEEN if (said := room.summary(scene.sight, last.point.state)))
+    assert found["magnetic_moment"]["unit"] == "A m²"
+    return np.array(found["magnetic_moment"]["value"]), scene.observe(last.point.state)
+
+
+@pytest.mark.parametrize("sections", [{"symmetry": "none"}, {"symmetry": "half"}, {"model": "solid"}])
+def test_moment_of_a_bent_strip(sections: dict[str, Any]) -> None:
+    """Of a remanence along the strip it is Br b h/mu0 times the way from root to tip, as F Br is Br times r,1."""
+    shell = {**STRIP, "thickness": "1.5 mm", "poisson_ratio": 0.0}
+    magnetic = {"remanent": {"polar": 90, "flux_density": "60 mT"}, "applied": {"polar": 0, "flux_density": "200 mT"}}
+    case = {"shell": shell, "boundary": {"root": "clamped"}, "magnetic": magnetic, "loading": {"kind": "field"}}
+    m, row = moment_and_tip(Case.model_validate(case | sections | {"points": {"tip": ["30 mm", 0, 0]}}))
+    way = np.array([30 * MM + row["tip_ux"], 0.0, row["tip_uz"]])
+    assert way[2] > 5 * MM
+    expected = 0.06 * 9 * MM * 1.5 * MM / (4e-7 * np.pi) * way
+    np.testing.assert_allclose(m, expected, atol=2e-6 * expected[2])  # the tip is one point of its edge
+
+
+def test_moment_of_what_is_induced() -> None:
+    """In a weak field, of a soft disc, chi/(1 + chi) B V/mu0, whether meridian, solid or half."""
+    shell = {
+        "geometry": "disc",
+        "radius": "20 mm",
+        "thickness": "1 mm",
+        "youngs_modulus": "1 GPa",
+        "poisson_ratio": 0.3,
+    }
+    magnetic = {"susceptibility": 2, "applied": {"polar": 0, "flux_density": "1 mT"}}
+    for sections in ({}, {"model": "solid"}, {"symmetry": "half"}):
+        case = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "loading": {"kind": "field"}}
+        m, row = moment_and_tip(Case.model_validate(case | sections))
+        volume = np.pi * 400 * MM**2 * 1 * MM
+        np.testing.assert_allclose(m, [0, 0, 1e-3 * 2 / 3 * volume / (4e-7 * np.pi)], rtol=1e-4, atol=1e-9 * m[2])
+        assert m[2] == pytest.approx(row["induced_z"] * volume / (4e-7 * np.pi), rel=1e-4)

@@ -1,0 +1,165 @@
+"""Langevin's law in a thin sheet: its energy in a field, known with three derivatives at the points of a model.
+
+Along b = mu0 H the material has mu0 M = J L(3 chi b/J), L(x) = coth x - 1/x, that is chi k b with k = 3 L(x)/x, and the
+coenergy w = chi b² W/2 with W = 6 ln (sinh x/x)/x²; both are functions of y = x², with
+
+    2 y k' = 3 (1 - k) - y k²/3,    (y W)' = k.
+
+Along the sheet b is B; across it is the number with B_n = b_n (1 + chi k), for which the energy
+
+    e = max over b_n of -w(|(B_t, b_n)|) - (B_n - b_n)²/2
+
+is stationary. With p = B_n², s = |B_t|² and kappa = chi k its derivatives are e_p = -kappa/(1 + kappa)/2 and
+e_s = -kappa/2. So what is solved for stays out of compiled kernels: they take a polynomial of third order about the
+present p and s, whose derivatives are those of e itself, as many as tangents and their derivatives ask for.
+"""
+
+from collections.abc import Callable, Sequence
+from math import factorial
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.following import PointField, at_quadrature
+
+Array = NDArray[np.float64]
+ORDERS = [(i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]]  # of derivatives by p and s
+SIZE = 2 + len(ORDERS)  # numbers of a polynomial: p and s, then its coefficients
+NEAR = 1.0  # y below which a series is summed; its terms are those of y/pi²
+TERMS = 18
+STEPS = 100  # of Newton's method at most, some six in practice
+
+
+def _series() -> Array:
+    """The coefficients of k, from its equation."""
+    a = [1.0]
+    for n in range(1, TERMS):
+        a.append(-sum(a[i] * a[n - 1 - i] for i in range(n)) / (3 * (2 * n + 3)))
+    return np.array(a)
+
+
+RATIO = np.polynomial.Polynomial(_series())
+COENERGY = np.polynomial.Polynomial(_series() / np.arange(1, TERMS + 1))
+
+
+def ratio(y: Array) -> Array:
+    """k of y."""
+    far = np.maximum(y, NEAR)
+    x = np.sqrt(far)
+    return np.asarray(np.where(y < NEAR, RATIO(np.minimum(y, NEAR)), 3 * (x / np.tanh(x) - 1) / far))
+
+
+def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
+    """k' and k'' of y."""
+    near, far, close = np.minimum(y, NEAR), np.maximum(y, NEAR), y < NEAR
+    x = np.sqrt(far)
+    c, inverse = 1 / np.tanh(x), 4 * np.exp(-2 * x) / np.expm1(-2 * x) ** 2  # coth x and 1/sinh² x
+    first = (1.5 * (c / x - inverse) - k) / far
+    second = (0.75 * (2 * c * inverse - inverse / x - c / far) / x - 2 * first) / far
+    return np.where(close, RATIO.deriv()(near), first), np.where(close, RATIO.deriv(2)(near), second)
+
+
+def coenergy(y: Array) -> Array:
+    """W of y."""
+    far = np.maximum(y, NEAR)
+    x = np.sqrt(far)
+    log = x + np.log(-np.expm1(-2 * x) / (2 * x))
+    return np.asarray(np.where(y < NEAR, COENERGY(np.minimum(y, NEAR)), 6 * log / far))
+
+
+def across(chi: Array, p: Array, s: Array, J: float) -> Array:
+    """|b_n|: Newton's method from below, where the function is concave, and between the bounds that it has."""
+    scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
+    lowest = normal / (1 + chi)
+    b = lowest
+    for _ in range(STEPS):
+        y = scale * (s + b**2)
+        k = ratio(y)
+        change = (normal - b * (1 + chi * k)) / (1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0]))
+        b = np.clip(b + change, lowest, normal)
+        if np.all(np.abs(change) <= 4e-16 * normal):
+            break
+    return np.asarray(b)
+
+
+def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) -> Array:
+    """mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1), of the normals n."""
+    s = np.sum(along * along, axis=-1, keepdims=True)
+    kappa = chi * ratio((3 * chi / J) ** 2 * (s + across(chi, normal**2, s, J) ** 2))
+    return np.asarray(kappa * (along + normal / (1 + kappa) * n))
+
+
+def expanded(chi: Array, p: Array, s: Array, J: float) -> Array:
+    """p, s and the coefficients of the polynomial (..., SIZE); see `energy`."""
+    b, scale = across(chi, p, s, J), (3 * chi / J) ** 2
+    y = scale * (s + b**2)
+    k = ratio(y)
+    k1, k2 = slopes_of_ratio(y, k)
+    q = 1 / (1 + chi * k)
+    T, T1, T2 = q**2, -2 * chi * k1 * q**3, -2 * chi * k2 * q**3 + 6 * (chi * k1) ** 2 * q**4
+    D = 1 - scale * p * T1  # of y = scale (s + p T(y)), whose derivatives follow
+    y_s, y_p = scale / D, scale * T / D
+    D_s, D_p = -scale * p * T2 * y_s, -scale * (T1 + p * T2 * y_p)
+    y_ss, y_ps = -y_s * D_s / D, -y_s * D_p / D
+    y_pp = scale * T1 * y_p / D - y_p * D_p / D
+    half = -chi / 2
+    derivatives = {
+        (0, 0): half * (s + b**2) * coenergy(y) - (np.sqrt(p) - b) ** 2 / 2,
+        (1, 0): half * k * q,
+        (0, 1): half * k,
+        (2, 0): half * k1 * T * y_p,
+        (1, 1): half * k1 * y_p,
+        (0, 2): half * k1 * y_s,
+        (3, 0): half * ((k2 * T - 2 * chi * k1**2 * q**3) * y_p**2 + k1 * T * y_pp),
+        (2, 1): half * (k2 * y_p**2 + k1 * y_pp),
+        (1, 2): half * (k2 * y_s * y_p + k1 * y_ps),
+        (0, 3): half * (k2 * y_s**2 + k1 * y_ss),
+    }
+    coefficients = [derivatives[i, j] / (factorial(i) * factorial(j)) for i, j in ORDERS]
+    return np.stack([*np.broadcast_arrays(p, s, *coefficients)], axis=-1)
+
+
+def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
+    """e from the polynomial P (`SIZE`,)."""
+    dp, ds = p - P[0], s - P[1]
+    return sum(P[2 + number] * dp**i * ds**j for number, (i, j) in enumerate(ORDERS))
+
+
+def induced(P: Sequence[Expr], B: Expr, normal: Expr, n: Expr) -> Expr:
+    """mu0 M at the present field, which is -de/dB."""
+    by_normal, by_along = (P[2 + ORDERS.index(order)] for order in ((1, 0), (0, 1)))
+    return -2 * (by_along * (B - normal * n) + by_normal * normal * n)
+
+
+def point_field(
+    field: PointField,
+    chi: fem.Constant | fem.Function,
+    J: float,
+    present: Callable[[], Sequence[tuple[Array, Array]]],
+    by: Callable[[], tuple[Any, ...]],
+) -> PointField:
+    """Let a field of twice `SIZE` numbers follow the polynomials at u and at u = 0.
+
+    Parameters
+    ----------
+    present
+        The field and the normals (cells, points, 3) at both.
+    by
+        The values that these depend on.
+    """
+
+    def values() -> Array:
+        numbers = at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
+        polynomials = []
+        for B, n in present():
+            p = np.sum(B * n, axis=-1) ** 2
+            s = np.maximum(np.sum(B * B, axis=-1) - p, 0.0)
+            polynomials.append(expanded(np.broadcast_to(numbers, p.shape), p, s, J))
+        return np.concatenate(polynomials, axis=-1)
+
+    own = chi.x.array if isinstance(chi, fem.Function) else chi.value
+    field.follow(values, lambda: (own, *by()))
+    return field
