@@ -91,7 +91,7 @@ class ChangingEntries:
 
     def __init__(self, V: fem.FunctionSpace, terms: Sequence[Coupled], clamped: Sequence[fem.DirichletBC]) -> None:
         self._terms, self._comm = terms, V.mesh.comm
-        self._own = slice(*(3 * at for at in V.dofmap.index_map.local_range))
+        self._own = slice(*(V.dofmap.index_map_bs * at for at in V.dofmap.index_map.local_range))
         held = np.zeros(self._own.stop - self._own.start, dtype=bool)
         for bc in clamped:
             dofs = bc.dof_indices()[0]

@@ -100,9 +100,7 @@ def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
     span = problem.meridian
     if span is None:
         return open_edges(patch or problem.triangulated(), problem.conditions, problem.loads.pressed)
-    places = span.sample()[[0, -1]][:, [0, 2]]
-    ends = {name: np.asarray(place) for name, place in zip(span.names, places, strict=True) if name}
-    return ring_openings(ends, problem.conditions)[1]
+    return ring_openings(span.ends(), problem.conditions, problem.loads.pressed)[1]
 
 
 def _surface(patch: PatchMesh) -> list[str]:
@@ -126,7 +124,10 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     """Cells and unknowns of the mesh, or of the meridian."""
     k = degree_of(problem.context)
     if patch is None:
-        return (count := len(meridian_vertices(problem)) - 1), 2 * (k * count + 1)
+        assert problem.meridian
+        pieces = max(len(problem.meridian.pieces), 1)
+        count = len(meridian_vertices(problem)) - pieces
+        return count, 2 * (k * count + pieces)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if problem.body:  # three hexahedra a layer above each triangle

@@ -170,7 +170,7 @@ def make_problem(
         azimuth=turn,
         turns=askew(parts) is None,
         shape=shape,
-        embedding=drawn.placed(shape),
+        embedding=drawn.embedding if span else drawn.placed(shape),
         points=points,
         size=size,
         included=[*included, *(f"own energy: {term.name}" for term in terms)],

@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -124,14 +124,16 @@ class Several:
     @cached_property
     def assembly(self) -> Assembly:
         """All of them as one mesh."""
-        from magshell_fenicsx.case.members import Members  # the solver takes long to import
+        from magshell_fenicsx.case.coaxial import meridians  # the solver takes long to import
+        from magshell_fenicsx.case.members import Members
 
         materials = self.materials or {}
         moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
         laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
         members = Members(self)
         of_shells = self.joints, self._thicknesses, moduli, laws
-        return Assembly(self.digest, members.whole, *of_shells, members.mirrors, members.half)
+        of_members = members.mirrors, partial(meridians, self), members.half
+        return Assembly(self.digest, members.whole, *of_shells, *of_members)
 
     def of(self, name: str) -> str:
         """The shell of an edge, or itself."""

@@ -110,6 +110,8 @@ class Assembly:
         Name of a shell -> the word for its law.
     mirrors
         Planes in which each shell is its own image, see `Outline.mirrors`.
+    span
+        The meridians of shells with one axis, see `shape.turning.Span`; or why there are none, in words.
     half
         Its half at such a plane, on whose positive side it is, or its sector.
     halved
@@ -125,12 +127,18 @@ class Assembly:
     moduli: Mapping[str, float] = field(default_factory=dict)
     laws: Mapping[str, str] = field(default_factory=dict)
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)
+    span: Callable[[], Any] = field(default=lambda: "there are several shells", repr=False)
     half: Callable[[Mirror], "Assembly"] | None = field(default=None, repr=False)
     halved: bool = False
     home: None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Assembly":
         return self
+
+    @cached_property
+    def turned(self) -> Any:
+        """The meridians, or why there are none."""
+        return self.span()
 
     @cached_property
     def patch(self) -> PatchMesh:

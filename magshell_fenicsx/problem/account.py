@@ -47,7 +47,8 @@ def account(
         else:
             left_out.append(part.absent)
     if model == "meridian":
-        left_out.append("waves around the axis (they are looked for at each point)")
+        between = "; where shells touch, not those that come and go between two" if loads.pairs else ""
+        left_out.append(f"waves around the axis (they are looked for at each point{between})")
     if isinstance(mirror, Sector):
         begin = degrees(mirror.azimuth) + 0.0
         left_out.append(

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import ceil, sqrt
+from math import ceil, inf, sqrt
 from typing import Any
 
 import numpy as np
@@ -309,11 +309,15 @@ class Problem:
 
 
 def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
-    """Vertices of the meridian's mesh, in the chart."""
+    """Vertices of the meridian's mesh, in the chart; those of several shells one after the other."""
     span = problem.meridian
     assert span
     if span.vertices is not None:
         return span.vertices
+    if span.pieces:
+        touching = {name for pair in problem.loads.pairs for name in pair.names}
+        pressed = {piece.name: [(inf, piece.length)] if piece.name in touching else [] for piece in span.pieces}
+        return np.concatenate([piece.vertices([*problem.pressed, *pressed[piece.name]]) for piece in span.pieces])
     pole = span.names[0] is None
     h = problem.material.h / span.curvature
     reach = max((one[1] for one in problem.pressed), default=0.0)

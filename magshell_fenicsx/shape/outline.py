@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
+from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Capped, Profile, Revolved
@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
 ANY = Grading([], 1.0)
 ROUNDING = 1e-9
+AROUND = 41  # samples of a meridian that is turned
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class Outline:
         The meridian; None if it is closed, or the surface is none of revolution.
     also
         Places (n, 3) that samples have besides: those where formulas are narrow.
+    askew
+        Why several shells have no meridian.
     """
 
     chart: Callable[[Mirror | None, Grading], Chart]
@@ -71,6 +74,7 @@ class Outline:
     from_pole: Callable[[Array], Array] | None = None
     span: Span | None = None
     also: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    askew: str | None = None
 
     def on_half(self, chart: Array) -> Array:
         """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
@@ -86,6 +90,9 @@ class Outline:
 
     def sample(self) -> Array:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        if self.span and self.span.pieces:
+            along = self.span.sample()
+            return np.vstack([*(along @ rotation(angle) for angle in np.linspace(0, 2 * pi, AROUND)), self.also])
         chart, nodes = self.charts(), self.nodes
         if chart is None:
             assert nodes is not None
@@ -153,7 +160,7 @@ class Outline:
 
     def placed(self, shape: Chart) -> Embedding:
         """The map to space of what is meshed: halves of several shells have charts in frames of their own."""
-        if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly) and shape.given.halved:
+        if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly):
             return shape.given.patch.embedding
         return self.embedding
 
@@ -187,13 +194,20 @@ def outline(shell: Surface | ShellSection) -> Outline:
         scale, given = (shell.unit or 1.0) / shell.reference, shell.files.given.get(shell.path)
         file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, given)
         if isinstance(given, Assembly):
+            span = given.turned
+
+            def embedded(nodes: Array) -> Array:  # they are meshed when it is asked for
+                return given.patch.embedding(nodes)
+
             return Outline(
                 lambda mirror, size: replace(file, given=given.half(mirror)) if mirror and given.half else file,
-                given.patch.embedding,
+                embedded,
                 normals,
                 lambda x: x,
                 None,
                 mirrors=given.mirrors,
+                span=span if isinstance(span, Span) else None,
+                askew=span if isinstance(span, str) else None,
             )
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:

@@ -168,12 +168,12 @@ def of_shape(shell: "ShellSection | Surface", outline: "Outline") -> Leaves:
             return not isinstance(factor, GivenField)  # patches are mapped onto themselves
         return mirrors_formula(factor, mirror, outline.sample())
 
-    reason = None
-    if not outline.round:
+    reason = outline.askew
+    if reason is None and not (outline.round or outline.span):
         reason = f"not with a {geometry} that is not closed around e3"
-    elif not outline.span:
+    elif reason is None and not outline.span:
         reason = "the section of the tube is closed: it has no edge to hold it by"
-    elif isinstance(factor, str) and not scalar_turns(factor, outline.span):
+    elif isinstance(factor, str) and outline.span and not scalar_turns(factor, outline.span):
         reason = "the thickness differs around e3"
     return Leaves(reason, mirrors=mirrors)
 

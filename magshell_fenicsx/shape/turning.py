@@ -20,8 +20,38 @@ SAME = 1e-9  # of the largest value: differences that are rounding
 
 
 @dataclass(frozen=True)
+class Piece:
+    """The meridian of one of several shells, a part of a `Span`.
+
+    Attributes
+    ----------
+    name
+        Of the shell.
+    ends
+        First and last value of the parameter.
+    names
+        Of both ends, with that of the shell; None for a pole.
+    place
+        Place (3,) in space -> parameter of the nearest place of it, and azimuth (rad).
+    vertices
+        Those of its mesh, with cells of that size up to that distance from its pole, where something presses on it.
+    """
+
+    name: str
+    ends: tuple[float, float]
+    names: tuple[str | None, str | None]
+    place: Callable[[Array], tuple[float, float]]
+    vertices: Callable[[Sequence[tuple[float, float]]], Array]
+
+    @property
+    def length(self) -> float:
+        """Of its parameter."""
+        return self.ends[1] - self.ends[0]
+
+
+@dataclass(frozen=True)
 class Span:
-    """A meridian, walked from the pole or one edge to the other.
+    """A meridian, walked from the pole or one edge to the other; or those of several shells with one axis.
 
     Attributes
     ----------
@@ -30,24 +60,26 @@ class Span:
     circles
         Where the curvature jumps.
     names
-        Of its ends; None for the pole.
+        Of its ends; None for a pole.
     embedding, normal
         Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
     place
         Chart (2,) of the surface -> parameter of this one and azimuth (rad).
     curvature
-        The largest of the meridian over 1/R, at least 1.
+        The largest of the meridian over 1/R, at least 1; of several that which has the most waves around e3.
     largest
         Size of cells that shows the imperfections.
     vertices
         Those of its mesh, if that is given.
     also
         Places (n, 3) of the surface at which formulas are narrow.
+    pieces
+        Those of several shells; none of one.
     """
 
     length: float
     circles: tuple[float, ...]
-    names: tuple[str | None, str]
+    names: tuple[str | None, ...]
     embedding: Embedding
     normal: Embedding
     place: Callable[[NDArray[np.float64]], tuple[float, float]]
@@ -55,16 +87,43 @@ class Span:
     largest: float = inf
     vertices: NDArray[np.float64] | None = None
     also: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    pieces: tuple[Piece, ...] = ()
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""
-        s = np.linspace(0.0, self.length, 401)
+        return self._at([np.linspace(first, last, 401, dtype=np.float64) for first, last in self._parts])
+
+    def between(self) -> NDArray[np.float64]:
+        """The same without its ends: a formula may divide by zero on the axis."""
+        return self._at([np.linspace(first, last, 401, dtype=np.float64)[1:-1] for first, last in self._parts])
+
+    def place_of(self, name: str, x: Array) -> tuple[float, float]:
+        """Parameter and azimuth (rad) of a named place, which is that of the shell in its name."""
+        piece = next((each for each in self.pieces if name.startswith(f"{each.name}_")), None)
+        return piece.place(x) if piece else self.place(x)
+
+    @property
+    def knots(self) -> Array:
+        """Parameters that cells do not pass over."""
+        return np.array(sorted({*np.ravel(self._parts), *self.circles}))
+
+    def ends(self) -> dict[str, NDArray[np.float64]]:
+        """Name of each edge -> its place (rho, z)."""
+        places = self._at([np.array(ends) for ends in self._parts])[:, [0, 2]]
+        return {name: np.asarray(place) for name, place in zip(self.names, places, strict=True) if name}
+
+    @property
+    def _parts(self) -> list[tuple[float, float]]:
+        return [piece.ends for piece in self.pieces] or [(0.0, self.length)]
+
+    def _at(self, parameters: Sequence[Array]) -> Array:
+        s = np.concatenate(parameters)
         return self.embedding(np.column_stack([s, 0 * s]))
 
 
 def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
     """Whether a formula has the same value all around; its unit of length is R over `length`."""
-    f, places = formula(text), length * _places(span)
+    f, places = formula(text), length * span.between()
     around, turned = length * span.also, length * _at_azimuth_zero(span.also)[0]
     return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]) and _same(
         [f(*around.T)[:, None], f(*turned.T)[:, None]]
@@ -81,7 +140,7 @@ def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, 
     length
         R in the unit of the formulas' places.
     """
-    vectors, places = vectors_of(components), _places(span)
+    vectors, places = vectors_of(components), span.between()
     if in_space:
         places = beside(places) * [1.0, 0.0, 1.0]
     turned, Q = _at_azimuth_zero(span.also)
@@ -97,9 +156,9 @@ def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
     return np.column_stack([rho, none, x[:, 2]]), np.moveaxis(Q, 2, 0)
 
 
-def field_turns(field: Callable[[Array], Array], span: Span) -> bool:
-    """Whether the smooth field of sources turns with the meridian and has no component across it, on the surface."""
-    return _turns(field, _places(span)[::20], ANGLES[:12])
+def field_turns(field: Callable[[Array], Array], span: Span, *, smooth: bool = True) -> bool:
+    """Whether a field, smooth as that of sources, turns with the meridian and has no component across it, there."""
+    return _turns(field, span.between()[::20], ANGLES[:12]) if smooth else _turns(field, span.between())
 
 
 def _turns(field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES) -> bool:
@@ -116,11 +175,6 @@ def vectors_of(components: Sequence[str]) -> Callable[[Array], Array]:
 def beside(x: Array) -> Array:
     """Places (n, 3), and others near them."""
     return np.vstack([x, x + NEAR * np.random.default_rng(2026).uniform(-1, 1, x.shape)])
-
-
-def _places(span: Span) -> Array:
-    """Along a meridian, without its ends: a formula may divide by zero on the axis."""
-    return span.sample()[1:-1]
 
 
 def _same(values: Sequence[Array]) -> bool:

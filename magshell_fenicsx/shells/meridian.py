@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from dolfinx import fem
@@ -24,12 +24,12 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
-from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import meridian_openings
+from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
@@ -37,6 +37,9 @@ from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 
 Array = NDArray[np.float64]
 
@@ -117,11 +120,16 @@ class MeridianModel(Thin):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
+    made_of
+        Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
+    touchings
+        The contacts of shells with each other.
     """
+
+    touchings: "Sequence[MeridianTouching]"
 
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
-    made_of: None = None  # of one material
     multiplicity = 1
     axes: ClassVar[list[int]] = [0, 2]
 
@@ -144,16 +152,25 @@ class MeridianModel(Thin):
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         of_place = partial(field_of_place, self.r0)
         loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
+        patches, count = meridian.patches, len(meridian.order)
+        for name in ("magnetic", "remanence"):
+            if given := getattr(loads, name):
+                loads = self.loads = replace(loads, **{name: given.on(patches, count)})
         self.sigma = default_penalty(degree) if sigma is None else sigma
         shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
-        self.thickness = thickness_field(thickness, self.r0) if thickness else None
+        self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
+        self.made_of: fem.Function | None = None
+        if material.shells:
+            self.made_of = material_field(material.shells, meridian.mesh, patches)
+        pressed = on_cells(loads.pressed, meridian) if loads.pressed else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
-            shape = Shape.of(natural_field(loads.natural, cells_of(self.r0), V), loads.natural, free)
+            loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
+            shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
         carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell)
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, made_of=self.made_of)
         around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
@@ -169,13 +186,13 @@ class MeridianModel(Thin):
             self.energies.append(factory.mirror_edges(self.held.mirror, np.array([0.0, 0.0, 1.0])))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
-        free_ends, self.without_potential = meridian_openings(meridian, conditions)
+        free_ends, self.without_potential = meridian_openings(meridian, conditions, loads.pressed)
         closed = enclosed(loads, free_ends, self.without_potential)
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += self.own_and_contacts(meridian.ends)
         for name, force in loads.forces.items():
-            self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
+            self.energies.append(pole_force(name, force, self.force_unit, around, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
             if forces(dead):
@@ -199,8 +216,23 @@ class MeridianModel(Thin):
             parameters |= self.growing.parameters(terms, parameters)
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
+        rule = factory.carrier.contact_rule
+        self.touchings = []
+        if loads.pairs:
+            from magshell_fenicsx.parts.touching.on_meridian import touchings
+
+            self.touchings = touchings(loads.pairs, self.r0, self.u, meridian.patches, self.material.h, rule)
+        for each in self.touchings:
+            stiffnesses |= each.history
         self.system = FiniteElementSystem(
-            self.u, terms, held, pattern, self.material.h, parameters=parameters, moving=moves, history=stiffnesses
+            self.u,
+            [*terms, *self.touchings],
+            held,
+            pattern,
+            self.material.h,
+            parameters=parameters,
+            moving=moves,
+            history=stiffnesses,
         )
         self._volume = self.kernels.compile("volume energy", volume)
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
@@ -208,7 +240,8 @@ class MeridianModel(Thin):
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
-        follows = self.growing or self.contacts or self.fields or self.factory.saturated or self.loads.moves
+        touched = self.contacts or self.loads.pairs
+        follows = self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
         if follows or any(e.density is None or e.counted for e in self.energies):
             return None
         free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
@@ -230,7 +263,8 @@ class MeridianModel(Thin):
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels))
+        of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
+        return ExcludedWaves(Waves(*of, self.touchings))
 
     @property
     def waves(self) -> Waves:
@@ -267,9 +301,8 @@ class MeridianModel(Thin):
     def _pressed(self) -> Pressed:
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
-        first = min(self.meridian.mesh.geometry.x[:, 0])
         lids = [
-            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=s > first)
+            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=not self.meridian.begins(name))
             for name, s in ends.items()
             if (motions := motions_of(self.loads, name))
         ]

@@ -8,13 +8,14 @@ this unit, but for its tangential part.
 With the mass of the shell as M, lambda is omega^2 rho R^2/E of small vibrations.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -85,7 +86,7 @@ class _Family:
     projection: Projection | None = None
     contains: Callable[[Vector], bool] = lambda vector: True
     rigid: int = 0  # dimension of the kernel: rigid motions of the undeformed shell that nothing holds
-    motion: Vector | None = None  # the one of them that the family contains, where it is not all of the kernel
+    motions: Sequence[Vector] = ()  # those of them that the family contains, where they are not all of the kernel
 
 
 @dataclass
@@ -133,8 +134,7 @@ class ShellModes:
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
             if family.contains is _turns:  # of a kernel with the motion along the axis
                 modes = modes[family.rigid :]
-            if family.motion is not None:
-                of_families.append(ShellMode(family.label, 0.0, _normalised(family.motion, M)))
+            of_families += [ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions]
             of_families += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
         return sorted(of_families, key=lambda mode: mode.eigenvalue)
 
@@ -183,7 +183,7 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
         waves = model.excluded_modes.waves
         wave_mass = f"{name}wave mass", of_waves(model, factor)
         if vibrating:
-            rho = model.r0.x.array[::2]
+            turning = model.held.turning() if rest else []
             yield _Family(
                 TORSION,
                 partial(waves.tangent, m=0),
@@ -191,7 +191,7 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
                 wave_mass,
                 contains=_turns,
                 rigid=free[-1] + free[0],  # its space has the motion along e3 too
-                motion=np.column_stack([rho, rho, 0 * rho]).ravel() if free[-1] else None,
+                motions=[_turned(model, cells) for cells in turning],
             )
         for m in range(1, waves.largest + 1):
             yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=free.get(m, 0))
@@ -212,6 +212,14 @@ def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
     phi.setArray(vector)
     M.mult(phi, product)
     return np.asarray(vector / np.sqrt(phi.dot(product)))
+
+
+def _turned(model: MeridianModel, cells: NDArray[np.bool_]) -> Vector:
+    """The motion of one shell about the axis."""
+    rho = np.zeros(len(model.r0.x.array) // 2)
+    nodes = model.V.dofmap.list[cells]
+    rho[nodes] = model.r0.x.array[::2][nodes]
+    return np.column_stack([rho, rho, 0 * rho]).ravel()
 
 
 def _turns(coefficients: Vector) -> bool:

@@ -31,6 +31,7 @@ from magshell_fenicsx.parts.supports.supports import free_motion
 from magshell_fenicsx.shells.terms import EnergyFactory
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
     from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
@@ -87,7 +88,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
-    touchings: "Sequence[Touching]" = ()
+    touchings: "Sequence[Touching] | Sequence[MeridianTouching]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None

@@ -16,36 +16,41 @@ ENDS = np.array([[0.0], [1.0]])  # of the reference cell
 
 
 class Revolution:
-    """The vertices of a meridian turned into `sectors` equal angles.
+    """The vertices of a meridian turned into `sectors` equal angles; at a pole all of them are one node.
 
     Parameters
     ----------
     kinks
-        Numbers of the inner vertices along the meridian that have a circle of nodes for each of their two cells, so
-        that fields may jump there.
+        Numbers of the cells along the meridian that share no circle of nodes with the one before, so that fields may
+        jump there.
 
     Attributes
     ----------
     ends
         (cells, 2) numbers of the circles at the ends of the cells along the meridian.
     r0, n0
-        (n, 3) undeformed placement and unit normal, lengths in R; a pole comes first.
+        (n, 3) undeformed placement and unit normal, lengths in R.
     cells
         (m, 3) node numbers of triangles with the outer side up.
     """
 
     def __init__(self, model: MeridianModel, sectors: int = 96, kinks: Sequence[int] = ()) -> None:
         self._model, V = model, model.V
-        vertices = np.argsort(V.tabulate_dof_coordinates()[:, 0])[:: model.degree]
-        cells = np.arange(len(vertices) - 1)
-        begin = cells + np.searchsorted(np.sort(kinks), cells, side="right")
+        self.order = order = model.meridian.order
+        vertices = V.dofmap.list[order][:, :2]
+        apart = vertices[1:, 0] != vertices[:-1, 1]
+        apart[np.asarray(kinks, dtype=np.int64) - 1] = True
+        begin = np.arange(len(vertices)) + np.cumsum([0, *apart])
         self.ends = np.column_stack([begin, begin + 1])
-        self._vertices = np.repeat(vertices, 1 + np.isin(np.arange(len(vertices)), kinks))
+        self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
+        self._at_ends[0, self.ends], self._at_ends[1, self.ends] = np.arange(len(vertices))[:, None], np.arange(2)
+        poles = model.meridian.poles
+        s = model.meridian.cells[tuple(self._at_ends)]
+        self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
         theta = np.arange(sectors) * 2 * np.pi / sectors
         cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
         basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # e_rho, e_theta, e_z
         self._basis = np.moveaxis(basis, -1, 0)
-        self._first = min(len(model.meridian.axis), 1)  # circle: all sectors meet in the pole
         normals = nodal_normals(model.r0)
         self.r0, self.n0 = self._turned(model.r0.x.array.reshape(-1, 2)), self._turned(normals[:, [0, 2]])
         self.cells = self._triangles(sectors)
@@ -59,10 +64,9 @@ class Revolution:
 
         At the pole, where the surface has no second direction, a little off it.
         """
-        values = self._at(f, np.array([[0.0], [1.0], [OFF_POLE]]))
-        if self._first:
-            values[:, 0, 0] = values[:, 0, 2]
-        return _revolved(values[:, :, :2])
+        values = self._at(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
+        at_pole = self._poles[self.ends][..., None]
+        return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
         """The same at reference points (q, 1) inside all cells: (6, cells, q, 3)."""
@@ -72,19 +76,23 @@ class Revolution:
         """The values of a field (1,) at the ends of all cells, or other reference points (q, 1): (cells, q)."""
         return self._at(f, points)[0, :, :, 0]
 
-    @property
-    def order(self) -> NDArray[np.int64]:
-        """The cells along the meridian."""
-        V = self._model.V
-        return np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
+    def vertices(self, V: fem.FunctionSpace) -> NDArray[np.int64]:
+        """The nodes of a space on the meridian at all circles."""
+        cells, ends = self._at_ends
+        return np.asarray(V.dofmap.list[self.order[cells], ends], dtype=np.int64)
+
+    def at_nodes(self, circles: Array) -> Array:
+        """Values (n, ...) at the nodes, of those (circles, sectors, ...) on all circles."""
+        kept = np.ones(circles.shape[:2], dtype=bool)
+        kept[self._poles, 1:] = False
+        return np.asarray(circles[kept])
 
     def _at(self, f: fem.Function, points: Array) -> Array:
         """(3, cells, q, components) values, first and second derivatives at reference points (q, 1)."""
         V = f.function_space
         cells, bs = V.dofmap.list, V.dofmap.bs
-        order = np.argsort(V.tabulate_dof_coordinates()[cells].mean(axis=1)[:, 0])
         table = V.element.basix_element.tabulate(2, points)[:, :, :, 0]
-        return np.asarray(np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[order]]))
+        return np.asarray(np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[self.order]]))
 
     def around(self, ends: Array, weight: Array) -> Array:
         """Values at the nodes, of those at the ends of all cells.
@@ -97,42 +105,40 @@ class Revolution:
             (cells, 2) of a cell's value in the mean over the two that meet.
         """
         at = self._means(ends, weight)
-        circles = at[self._first :, None]
-        if at.ndim == 1:
-            circles = np.repeat(circles, len(self._basis), axis=1)
-        elif at.ndim == 2:
-            circles, at = (circles[:, :, None] @ self._basis)[:, :, 0], at * [0.0, 0.0, 1.0]
-        else:
+        circles = np.repeat(at[:, None], len(self._basis), axis=1)
+        if at.ndim == 2:
+            circles = (circles[:, :, None] @ self._basis)[:, :, 0]
+            circles[self._poles] *= [0.0, 0.0, 1.0]
+        elif at.ndim == 3:
             circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
-        return np.concatenate([at[: self._first], circles.reshape(-1, *at.shape[1:])])
+        return self.at_nodes(circles)
 
     def _means(self, ends: Array, weight: Array) -> Array:
         """The weighted mean of the cells that meet at each circle, of values (cells, 2, ...) at their ends."""
         weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
 
         def sums(values: Array) -> Array:
-            total = np.zeros((len(self._vertices), *values.shape[2:]))
+            total = np.zeros((len(self._poles), *values.shape[2:]))
             np.add.at(total, self.ends, values)
             return total
 
         return np.asarray(sums(weight * ends) / sums(weight))
 
     def _turned(self, nodal: Array) -> Array:
-        """(rho, z) components at the meridian's nodes -> vectors at the pole and on the circles."""
-        along = nodal[self._vertices]
-        turning = along[self._first :, None]
-        circles = turning[:, :, :1] * self._basis[:, 0] + turning[:, :, 1:] * self._basis[:, 2]
-        pole = along[: self._first] * [0.0, 1.0]
-        return np.concatenate([np.insert(pole, 1, 0.0, axis=1), circles.reshape(-1, 3)])
+        """(rho, z) components at the meridian's nodes -> vectors at the poles and on the circles."""
+        along = nodal[self.vertices(self._model.V)]
+        along = np.where(self._poles[:, None], along * [0.0, 1.0], along)[:, None]
+        return self.at_nodes(along[:, :, :1] * self._basis[:, 0] + along[:, :, 1:] * self._basis[:, 2])
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
+        """Two for each cell and sector; one beside a pole."""
+        first = np.cumsum([0, *np.where(self._poles, 1, sectors)])
         sector = np.arange(sectors)
-        next_sector = (sector + 1) % sectors
-        cap = np.column_stack([0 * sector, 1 + sector, 1 + next_sector])[: sectors * self._first]
-        inner = self._first + sectors * (self.ends[self._first :, :1] - self._first)
-        a, b, c, d = inner + sector, inner + next_sector, inner + sectors + sector, inner + sectors + next_sector
-        bands = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, c, d), (a, d, b))]
-        return np.concatenate([cap, *bands])
+        ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
+        (a, c), (b, d) = (np.moveaxis(each[self.ends], 1, 0) for each in (ring, np.roll(ring, -1, axis=1)))
+        begins, ends = (~self._poles[each] for each in self.ends.T)
+        bands = [(ends, (a, c, d)), (begins, (a, d, b))]
+        return np.concatenate([np.stack(corners, axis=-1)[which].reshape(-1, 3) for which, corners in bands])
 
 
 def _revolved(values: Array) -> Array:

@@ -7,7 +7,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from dolfinx import fem
@@ -247,14 +247,16 @@ class ShellModel(Thin):
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
+        meeting: "Sequence[Touching]" = ()
         if loads.pairs:
             from magshell_fenicsx.parts.touching.building import touchings
 
             of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
             thick = carrier.contact_rule, factor, factory.law_of_cells.thins
             surfaces = self.r0, self.u, midsurface.patches
-            self.touchings = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape)
-            terms += self.touchings
+            meeting = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape)
+            terms += meeting
+        self.touchings = meeting
         if loads.joints or midsurface.feet:
             from magshell_fenicsx.shells.tee import tees
 
@@ -289,13 +291,13 @@ class ShellModel(Thin):
             **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
-        for each in self.touchings:
+        for each in meeting:
             parameters |= each.entered(parameters)
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        for each in self.touchings:
+        for each in meeting:
             stiffnesses |= each.history
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
+from magshell_fenicsx.assembly.coupled import with_entries
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
@@ -29,6 +30,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
+from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
 
@@ -44,6 +46,8 @@ class Waves:
         Its terms as functions of a jet.
     supports
         What is held.
+    touching
+        Contacts, whose entries are not in the pattern of the others.
 
     Attributes
     ----------
@@ -64,7 +68,9 @@ class Waves:
         carrier: Carrier,
         supports: Supports,
         log: KernelLog,
+        touching: Sequence[MeridianTouching] = (),
     ) -> None:
+        self.touching = touching
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
         self._m = fem.Constant(V.mesh, 1.0)
@@ -97,7 +103,16 @@ class Waves:
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         (entries,) = self._system.at(state).assembled(lambda: self._entries(state, [m]))
-        return self._filled("tangent", entries.ravel(), m)
+        return self._touched(state, self._filled("tangent", entries.ravel(), m), m)
+
+    def _touched(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
+        """With the entries of contacts at a state."""
+        if not self.touching:
+            return K
+        entries = self._system.at(state).of(lambda: [(1.0, each.entries_of_waves(m)) for each in self.touching])
+        fixed = np.zeros(K.getSize()[0], dtype=bool)
+        fixed[self._rows(m)] = True
+        return with_entries(K, entries, fixed)
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
         """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi and m at a time."""
@@ -126,7 +141,15 @@ class Waves:
         between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
         assembled. Only those that are not positive definite are factored for their inertia.
         """
-        return self.counts_of(self.numbers(state))
+        values = self.numbers(state)
+        if not self.touching:
+            return self.counts_of(values)
+        unstable = list[int]()
+        for m in range(1, self.largest + 1):
+            K = self._filled("interpolated", self._weights[m] @ values, m)
+            self._counting.factor(self._touched(state, K, m))
+            unstable.append(self._counting.negative_pivots)
+        return unstable
 
     def numbers(self, state: State) -> NDArray[np.float64]:
         """(5, entries) of the matrices at the five m."""
@@ -304,9 +327,9 @@ class ExcludedWaves:
         return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
     @property
-    def tangents(self) -> Waves:
-        """For a `Watch`."""
-        return self.waves
+    def tangents(self) -> Waves | None:
+        """For a `Watch`; those of contacts have no pattern in common."""
+        return None if self.waves.touching else self.waves
 
     def counts(self, state: State) -> Sequence[int]:
         """Numbers of unstable directions of all families at a state."""

@@ -71,9 +71,10 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
     """The meridian, whole on every rank; `assembled` as of the model."""
     span = problem.meridian
     assert span
-    points = {name: span.place(x) for name, x in problem.points.items()}
-    vertices = meridian_vertices(problem)
-    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
+    named = {name: next(of for of, at in problem.points.items() if at is x) for name, x in problem.points.items()}
+    points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
+    pieces = [(piece.name, piece.ends) for piece in span.pieces]
+    meridian = make_meridian(span.embedding, meridian_vertices(problem), span.names, points, span.curvature, pieces)
     return MeridianModel(
         meridian,
         problem.material,

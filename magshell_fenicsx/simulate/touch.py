@@ -14,7 +14,9 @@ from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 from magshell_fenicsx.parts.touching.section import Pair
+from magshell_fenicsx.parts.touching.touching import Touching
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -82,10 +84,11 @@ def recut(stage: Stage, low: Point, high: Point) -> State | None:
 
     None if these would not be much better.
     """
-    if not stage.scene.model.touchings:
+    touchings = [each for each in stage.scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
+    if not touchings:
         return None
     at = stage.scene.model.system.at(stage.leave(high.state))
-    numbers = {each.pair.cuts: at.of(each.recut) for each in stage.scene.model.touchings}
+    numbers = {each.pair.cuts: at.of(each.recut) for each in touchings}
     changed = {name: number for name, number in numbers.items() if number is not None}
     return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
@@ -105,13 +108,18 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         If one does.
     """
     model, comm = stage.scene.model, stage.scene.comm
-    if model.axisymmetric or not model.touchings:
+    if not model.touchings:
+        return
+    if model.axisymmetric:
+        places = [model.system.with_ghosts(s.u, s.mu).reshape(-1, 2) for s in map(stage.leave, (low.state, high.state))]
+        _refuse_through(model.touchings, places)
         return
     ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
     whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
     x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
     x = x0 + ends[1][: model.system.size].reshape(-1, 3)
-    half = h / 2 * min(model.system.at(stage.leave(high.state)).of(each.thinner) for each in model.touchings)
+    at, touchings = model.system.at(stage.leave(high.state)), [t for t in model.touchings if isinstance(t, Touching)]
+    half = h / 2 * min(at.of(each.thinner) for each in touchings)
     seen_through = [*model.mirror.sides.values()] if model.multiplicity > 1 else []
     for plane in (each for each in model.planes if each not in seen_through):
         before, after = plane.beyond(x0), plane.beyond(x)
@@ -123,8 +131,14 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
                 low,
                 final=True,
             )
-    for each in model.touchings:
-        if each.through(*whole):
+    _refuse_through(touchings, whole)
+
+
+def _refuse_through(
+    touchings: Sequence[Touching] | Sequence[MeridianTouching], ends: Sequence[NDArray[np.float64]]
+) -> None:
+    for each in touchings:
+        if each.through(*ends):
             raise StepTooLong(f"the shortest step passes {each.pair.words} through each other")
 
 

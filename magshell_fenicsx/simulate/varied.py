@@ -421,8 +421,7 @@ def moved(scene: Scene, new: Problem) -> Problem:
         assert made.meridian
         vertices = made.meridian.vertices
         assert vertices is not None
-        knots = np.array([0.0, *old.meridian.circles, old.meridian.length])
-        places = np.array([0.0, *new.meridian.circles, new.meridian.length])
+        knots, places = old.meridian.knots, new.meridian.knots
         if knots.shape != places.shape:
             raise NoSystem("a rim of a dimple appears or vanishes on the way")
         return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))

@@ -221,7 +221,6 @@ def test_a_step_that_passes_through() -> None:
     [
         ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
         ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
-        ({"symmetry": "axisymmetric"}, "symmetry: axisymmetric: shells that may touch are modelled all around"),
         (
             {"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}},
             "contact: needs the same thickness everywhere; leave out shell.thickness_factor",

@@ -1,7 +1,7 @@
 """The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, sqrt
 
@@ -12,10 +12,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
+from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 MOST_CELLS = 1_000_000
-Names = tuple[str | None, str]
+ROUNDING = 1e-9  # of a parameter
+Names = Sequence[str | None]
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Meridian:
     mesh
         Interval mesh over the parameter s, the distance from the origin of the chart.
     axis
-        Facets (local numbers) of the point on the axis, none where the surface has a hole there.
+        Facets (local numbers) of the points on the axis, none where the surface has holes there.
     ends
         Name -> facets of the ends that are edges of the surface.
     embedding
@@ -35,7 +37,9 @@ class Meridian:
     points
         Name -> parameter s and azimuth (rad) of a place whose displacement is observed.
     curvature
-        The largest of the meridian over 1/R, at least 1.
+        See `shape.turning.Span`.
+    patches
+        Name of each of several shells -> which cells; none of one.
     """
 
     mesh: mesh.Mesh
@@ -44,6 +48,27 @@ class Meridian:
     embedding: Embedding
     points: Mapping[str, tuple[float, float]]
     curvature: float
+    patches: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def shells(self) -> tuple[str, ...]:
+        """The names of several shells."""
+        return tuple(self.patches)
+
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """The cells along the parameter."""
+        return np.argsort(self._ends.mean(axis=1))
+
+    @property
+    def cells(self) -> Array:
+        """(cells, 2) parameters at the ends of the cells, along it."""
+        return self._ends[self.order]
+
+    @property
+    def poles(self) -> Array:
+        """The parameters of the points on the axis, in ascending order."""
+        return np.sort(self._at(self.axis))
 
     @property
     def reach(self) -> float:
@@ -52,7 +77,33 @@ class Meridian:
 
     def parameter(self, end: str) -> float:
         """s there."""
-        return float(self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, self.ends[end])[0, 0], 0])
+        return float(self._at(self.ends[end])[0])
+
+    def begins(self, end: str) -> bool:
+        """Whether the parameter grows from there."""
+        return bool(np.isclose(self._ends.min(axis=1), self.parameter(end)).any())
+
+    def facets_at(self, point: str) -> NDArray[np.int32]:
+        """The point of the axis at a named place, or next to it."""
+        away = np.abs(self._at(self.axis) - self.points[point][0])
+        return np.asarray(self.axis[away == away.min(initial=inf)][:1])
+
+    def by_shell(self, facets: NDArray[np.int32]) -> list[NDArray[np.int32]]:
+        """Those of each of several shells; all of one."""
+        s = self._at(facets)
+        inside = [self._ends[of] for of in self.patches.values()] or [self._ends]
+        return [facets[(ends.min() <= s) & (s <= ends.max())] for ends in inside]
+
+    @property
+    def _ends(self) -> Array:
+        """The same in the order of the cells' numbers."""
+        return np.sort(self.mesh.geometry.x[compat.corner_numbers(self.mesh), 0], axis=1)
+
+    def _at(self, facets: NDArray[np.int32]) -> Array:
+        """Parameters of facets, of which dolfinx wants one at least."""
+        if not len(facets):
+            return np.empty(0)
+        return np.asarray(self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, facets).ravel(), 0])
 
     def section(self, s: Array) -> Array:
         """(n, 2) rho and z at some parameters."""
@@ -79,6 +130,7 @@ def make_meridian(
     names: Names = (None, "rim"),
     points: Mapping[str, tuple[float, float]] | None = None,
     curvature: float = 1.0,
+    pieces: Sequence[tuple[str, tuple[float, float]]] = (),
 ) -> Meridian:
     """Mesh the meridian.
 
@@ -89,24 +141,36 @@ def make_meridian(
     names
         Of its ends, None for the axis.
     points
-        See `Meridian`; by default the one on the axis, "pole".
+        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place.
+    pieces
+        Name and ends of each of several shells, which no cells join.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
+    parts = [ends for _, ends in pieces] or [(float(vertices[0]), float(vertices[-1]))]
+    first = np.searchsorted([begin for begin, _ in parts], vertices[:-1] + ROUNDING)
+    inside = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - ROUNDING
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
         MPI.COMM_SELF,
-        cells=np.column_stack([numbers[:-1], numbers[1:]]),
+        cells=np.column_stack([numbers[:-1], numbers[1:]])[inside],
         x=vertices[:, None].astype(np.float64),
         e=element,
     )
     domain.topology.create_connectivity(0, 1)
     facets = [
-        mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.isclose(x[0], end))
-        for end in (vertices[0], vertices[-1])
+        mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.abs(x[0] - end) < ROUNDING)
+        for ends in parts
+        for end in ends
     ]
-    axis = np.empty(0, np.int32) if names[0] else facets[0]
+    poles = [facet for name, facet in zip(names, facets, strict=True) if not name]
+    axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
-    return Meridian(domain, axis, ends, embedding, points or {"pole": (0.0, 0.0)}, curvature)
+    if points is None or (pieces and "pole" not in points):
+        highest = float(vertices[np.argmax(embedding(np.column_stack([vertices, 0 * vertices]))[:, 2])])
+        points = {**(points or {}), "pole": (highest if pieces else 0.0, 0.0)}
+    middles = domain.geometry.x[compat.corner_numbers(domain), 0].mean(axis=1)
+    patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in pieces}
+    return Meridian(domain, axis, ends, embedding, points, curvature, patches)
 
 
 def graded_vertices(

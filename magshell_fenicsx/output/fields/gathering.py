@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
-from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, SurfaceGatherer, grown
+from magshell_fenicsx.output.fields.surface import PRESSURE, SHELL, W0, Surface, SurfaceGatherer, grown
 from magshell_fenicsx.shells.revolution import ENDS, Revolution
 
 if TYPE_CHECKING:  # one of them is built
@@ -51,15 +51,20 @@ class RevolvedGatherer:
             None if model.thickness is None else swept.scalars(model.thickness, at) for at in (ENDS, self._inner)
         )
         others = loads.contacts, loads.remanence, loads.natural
-        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
-        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
+        own = model.made_of
+        made_of = None if own is None else own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[swept.order, 0]]
+        self._law = model.material.law_in(made_of)
+        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others, made_of)
+        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural, made_of)
         self._at_ends = Stresses(r, model.material, thick).frame
         if isinstance(model.meridian.embedding, Deviated):
-            s = np.sort(model.meridian.mesh.geometry.x[:, 0])
-            embedding = model.meridian.embedding
+            s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
             deviations = (*embedding.deviations, *grown(loads.growing, mu))
             w0 = replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s])) / model.material.h
-            self._fields.constant[W0] = np.column_stack([w0[:-1], w0[1:]])
+            self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))
+        if inside := [*model.meridian.patches.values()]:
+            number = np.argmax(inside, axis=0)[swept.order, None].astype(np.float64)
+            self._fields.constant[SHELL] = np.asarray(np.repeat(number, 2, axis=1))
         self._constant = self._around(self._fields.constant)
 
     def _kinks(self) -> list[int]:
@@ -92,11 +97,11 @@ class RevolvedGatherer:
         pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
-        values |= rubber_fields(values, self._model.material.law)
+        values |= rubber_fields(values, self._law)
         turned = self._around(values)
         fields = self._constant | turned
         shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
-        return Surface(*shape, fields, (), jumps["M"], jumps["E"])
+        return Surface(*shape, fields, (), jumps["M"], jumps["E"], shells=self._model.meridian.shells)
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
@@ -105,35 +110,39 @@ class RevolvedGatherer:
 class RecoveredMeridian:
     """Takes components along and across the meridian from samples in its cells to their ends.
 
-    At a pole, where both are even functions of the arc length, the first cell has its mirror image beside it.
+    At a pole, where both are even functions of the arc length, the cell has its mirror image beside it.
     """
 
     def __init__(self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array) -> None:
-        s = np.sort(model.meridian.mesh.geometry.x[:, 0])
-        begin, length = s[:-1, None], np.diff(s)[:, None]
-        samples, ends = begin + length * inner[:, 0], swept.ends
-        self._image = int(len(model.meridian.axis) > 0)
+        s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
+        length, cells = np.diff(s), np.arange(len(s))
+        samples = s[:, :1] + length * inner[:, 0]
         vertices = np.empty(ends.max() + 1)
-        vertices[ends] = np.column_stack([s[:-1], s[1:]])
-        if self._image:
-            samples, length = np.concatenate([2 * s[0] - samples[:1], samples]), length[[0, *range(len(length))]]
-            vertices, ends = np.append(vertices, 2 * s[0] - s[1]), np.concatenate([[[0, len(vertices)]], ends])
-        frames = np.ones((len(vertices), 1, 1))
-        of = ends, samples[..., None], length * rule, vertices[:, None], frames
-        self._recovery, self._weight = Recovery(*of, model.degree), (length * rule)[self._image :]
-        cells, count = np.arange(self._image, len(ends)), len(inner)
+        vertices[ends] = s
+        beside, end = np.nonzero(np.isclose(s[..., None], poles).any(axis=2))
+        self._beside, pole, far = beside, s[beside, end], s[beside, 1 - end]
+        images = len(vertices) + np.arange(len(beside))
+        of = (
+            np.concatenate([ends, np.column_stack([ends[beside, end], images])]),
+            np.concatenate([samples, 2 * pole[:, None] - samples[beside]])[..., None],
+            np.concatenate([length, length[beside]]) * rule,
+            (vertices := np.concatenate([vertices, 2 * pole - far]))[:, None],
+            np.ones((len(vertices), 1, 1)),
+        )
+        self._recovery, self._weight = Recovery(*of, model.degree), length * rule
+        count = len(inner)
         hats = np.column_stack([1 - inner[:, 0], inner[:, 0]])
         self._to_samples = self._recovery.at(
-            np.repeat(cells, count), samples[self._image :].reshape(-1, 1), np.tile(hats, (len(cells), 1))
+            np.repeat(cells, count), samples.reshape(-1, 1), np.tile(hats, (len(cells), 1))
         )
-        at_ends = np.repeat(cells, 2), vertices[ends[self._image :]].reshape(-1, 1), np.tile(np.eye(2), (len(cells), 1))
+        at_ends = np.repeat(cells, 2), vertices[ends].reshape(-1, 1), np.tile(np.eye(2), (len(cells), 1))
         self._to_ends = self._recovery.at(*at_ends)
 
     def components(self, stresses: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, float]]:
         """Those (cells, 2, 3) at the ends, of (cells, q, 3), and by how much those of the samples differ."""
         at_ends, jumps = {}, {}
         for name, S in stresses.items():
-            fit = self._recovery.coefficients(np.concatenate([S[: self._image], S]))
+            fit = self._recovery.coefficients(np.concatenate([S, S[self._beside]]))
             at_ends[name] = (self._to_ends @ fit).reshape(-1, 2, 3)
             if name in ROUNDING:
                 smooth = (self._to_samples @ fit).reshape(S.shape)

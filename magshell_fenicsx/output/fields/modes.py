@@ -154,8 +154,7 @@ def _revolved_wave(model: "MeridianModel", u: Vector, m: int, vector: Vector) ->
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
-    nodes = model.excluded_modes.waves.V.tabulate_dof_coordinates()[:, 0]
-    U_and_V, V, W = vector.reshape(-1, 3)[np.argsort(nodes)[:: model.degree]].T[:, :, None]
+    U_and_V, V, W = vector.reshape(-1, 3)[swept.vertices(model.excluded_modes.waves.V)].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
     radial, azimuthal = (U_and_V - V) * cosine, V * sine
@@ -164,9 +163,7 @@ def _revolved_wave(model: "MeridianModel", u: Vector, m: int, vector: Vector) ->
         radial * np.sin(theta) + azimuthal * np.cos(theta),
     )
     v = np.stack([x, y, W * cosine], axis=-1)
-    first = min(len(model.meridian.axis), 1)  # all sectors share the pole
-    at_nodes = np.concatenate([v[:first, 0], v[first:].reshape(-1, 3)])
-    return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes
+    return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), swept.at_nodes(v)
 
 
 def wave_number(surface: Surface) -> int | None:

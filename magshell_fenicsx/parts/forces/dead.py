@@ -196,7 +196,8 @@ class DeadSection(PathStep):
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
         x = outline.sample() if potentials or len(fixed) < len(self.loads) else np.zeros((0, 3))
-        patches = any(load.over not in (None, "all") for load in self.loads)
+        whole = {None, "all", *(piece.name for piece in (span.pieces if span else ()))}
+        patches = any(load.over not in whole for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)

@@ -13,8 +13,10 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, Force, PointForce
 from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
+from magshell_fenicsx.models.shell.thickness import patch_of
+from magshell_fenicsx.parts.forces.dead_load import within
 from magshell_fenicsx.parts.loads import forces
 
 Integral = Callable[[Expr], ufl.Form]
@@ -31,13 +33,22 @@ class Around:
         """Along the undeformed circle of an end."""
         return lambda f: f * self.carrier.r0[0] * self.carrier.ds(self.meridian.ends[name])
 
-    def pole(self) -> Integral:
-        """The value on the axis, over 2 pi."""
-        return lambda f: f / (2 * np.pi) * self.carrier.ds(self.meridian.axis)
+    def pole(self, point: str) -> Integral:
+        """The value at a point on the axis, over 2 pi."""
+        return lambda f: f / (2 * np.pi) * self.carrier.ds(self.meridian.facets_at(point))
 
-    def patch(self, radius: float) -> Integral:
-        """Of f (1 - d^2/radius^2)^2, d the distance in space from the pole."""
-        a, pole = self.carrier.constant(radius), self.carrier.constant(self.meridian.section(np.zeros(1))[0])
+    def area(self, load: AreaForce) -> Integral:
+        """Over the undeformed area, or that of one of several shells."""
+        over = self.carrier.over_area()
+        if load.patch is None:
+            return over
+        marked = within(self.carrier.mesh, patch_of(self.meridian.patches, load.patch))
+        return lambda f: over(marked * f)
+
+    def patch(self, radius: float, point: str) -> Integral:
+        """Of f (1 - d^2/radius^2)^2, d the distance in space from a point on the axis."""
+        at = np.array([self.meridian.points[point][0]])
+        a, pole = self.carrier.constant(radius), self.carrier.constant(self.meridian.section(at)[0])
         inside = 1 - ufl.dot(self.carrier.r0 - pole, self.carrier.r0 - pole) / a**2
         weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.carrier.over_area()
         return lambda f: over(weight * f)
@@ -51,15 +62,15 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog)
     parts, size = list[tuple[Expr, Integral]](), 0.0
     for load in forces(loads):
         if isinstance(load, PointForce):
-            over = on.pole()
+            over = on.pole(load.point)
         elif isinstance(load, EdgeForce):
             over = on.end(load.edge)
         else:
-            over = on.carrier.over_area()
+            over = on.area(load)
         if not isinstance(load, PointForce) and callable(load.force):
             along, whole = pattern_field(load.force, on.carrier.r0, FINER)
             parts.append((along, over))
-            fitted = whole is not None and isinstance(load, AreaForce)
+            fitted = whole is not None and isinstance(load, AreaForce) and load.patch is None
             size += whole if fitted and whole is not None else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
             continue
         whole = _whole(over, on, log)
@@ -77,10 +88,11 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog)
     return Energy(name, energy, name, linear=True), size
 
 
-def pole_force(name: str, patch: float, unit: float, on: Around, log: KernelLog) -> Energy:
-    """A force against e3 at the pole, or spread over a patch of that radius."""
-    over = on.patch(patch) if patch else on.pole()
-    share = on.carrier.constant(unit / _whole(over, on, log))
+def pole_force(name: str, force: Force, unit: float, on: Around, log: KernelLog) -> Energy:
+    """A force against the outward normal at a point on the axis, or spread over a patch of that radius."""
+    over = on.patch(force.patch, force.point) if force.patch else on.pole(force.point)
+    begins = np.isclose(on.meridian.cells[:, 0], on.meridian.points[force.point][0]).any()  # the normal is e3 there
+    share = on.carrier.constant((1.0 if begins else -1.0) * unit / _whole(over, on, log))
     return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
 
 

@@ -146,7 +146,7 @@ def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
     if off and drawn.round:
         reason = "an imperfection is off the axis"
     elif drawn.span:
-        places = drawn.span.sample()[1:-1]
+        places = drawn.span.between()
         turned = [np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]]
         if not all(_same(turned[0], w0) for w0 in turned):
             reason = "an imperfection differs around e3"

@@ -1,6 +1,8 @@
 """The field section in the model's frame."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from math import sqrt
 from typing import Any
 
@@ -169,7 +171,8 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     formulas = magnetic.applied.components if magnetic.applied.beside else None
     alone = formulas or not magnetic.applied.beside or not strength(context)
     magnetised = magnetic.remanent.directions() if magnetic.remanent else []
-    vectors = [d.vector() for d in (*magnetised, *([] if alone else [magnetic.applied]))]
+    given = [_on_patch(d, context, 0.0) for d in magnetised]
+    vectors = [v for v in given if not callable(v)] + ([] if alone else [magnetic.applied.vector()])
     whole = turns(context)  # then the rotation is a part of the field at each place
     turning = [] if whole else [step.to.vector() for step in _rotations(context)]
     remanent = magnetic.remanent or RemanentSection.model_construct()
@@ -183,6 +186,15 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         by_place = by_points(remanent)
         fields.append(lambda x: by_place(x, x))
         askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
+    patterns = {name: of for name, of in zip(remanent.patches or {}, given, strict=False) if isinstance(of, Placed)}
+    for name, pattern in patterns.items():
+        if pattern.pattern in (radial, tangential):
+            continue
+        fields.append(partial(_at_places, pattern))
+        pieces = tuple(piece for piece in (outline.span.pieces if outline.span else ()) if name.startswith(piece.name))
+        span = outline.span and replace(outline.span, pieces=pieces)
+        if not (span and field_turns(fields[-1], span, smooth=False)):
+            askew.append(f"the remanence of {name} differs around e3")
     if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
         askew.append("the formula of the remanence differs around e3")
     if formulas and not (outline.span and vector_turns(formulas, outline.span, in_space=True)):
@@ -209,7 +221,10 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
                 for field, places in (*((field, x) for field in fields), *((field, few) for field in sources))
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
-            return uniform and varying and kinds.get(remanent.kind, sign) == sign
+            of_shells = [(each.pattern, each.place.Q[:, 2]) for each in patterns.values()]
+            even = all(p is not radial or sign == 1.0 for p, _ in of_shells)
+            even &= all(p is not tangential or np.abs(S @ e3 - sign * e3).max() <= SAME for p, e3 in of_shells)
+            return uniform and varying and even and kinds.get(remanent.kind, sign) == sign
 
         return soft_mirrored(magnetic.susceptibility, outline, mirror) and (images(1.0) or images(-1.0))
 
@@ -220,6 +235,11 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
             mirrors,
         )
     ]
+
+
+def _at_places(pattern: Pattern, x: Array) -> Array:
+    """A pattern that does not depend on the normal, at places (n, 3)."""
+    return np.asarray(pattern(x[None], 0 * x[None])[0])
 
 
 def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:

@@ -6,7 +6,7 @@ motions v and w of the edge (Romano 1972, Buefler 1984, Schweizerhof and Ramm 19
 a single direction or in its own plane: then the pressure has a potential, `densities.swept`. Elsewhere it has none.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence, Set
 
 import numpy as np
 from dolfinx import fem
@@ -88,7 +88,7 @@ def openings(
     return names, without_potential(names, conditions, places)
 
 
-def on_cells(sides: Mapping[str, float], midsurface: Midsurface) -> fem.Function:
+def on_cells(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> fem.Function:
     """Of each cell, (1,): the side on which a pressure acts there, 0 on others.
 
     Parameters
@@ -116,8 +116,12 @@ def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dic
     return {name: facets[np.array([acts(f) for f in facets], dtype=bool)] for name, facets in edges.items()}
 
 
-def ring_openings(ends: Mapping[str, Array], conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
-    """The same of a meridian with ends at (rho, z)."""
+def ring_openings(
+    ends: Mapping[str, Array], conditions: Mapping[str, Condition], on: Collection[str] = ()
+) -> tuple[list[str], tuple[str, ...]]:
+    """The same of a meridian with ends at (rho, z); `on` are the shells that the pressure acts on, all without."""
+    if on:
+        ends = {name: at for name, at in ends.items() if any(name.startswith(f"{shell}_") for shell in on)}
 
     def ring(name: str) -> Array:
         rho, z = ends[name]
@@ -127,10 +131,12 @@ def ring_openings(ends: Mapping[str, Array], conditions: Mapping[str, Condition]
     return names, without_potential(names, conditions, ring)
 
 
-def meridian_openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
+def meridian_openings(
+    meridian: Meridian, conditions: Mapping[str, Condition], on: Collection[str] = ()
+) -> tuple[list[str], tuple[str, ...]]:
     """The ends that are not held, and those of them where a live pressure has no potential."""
     places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
-    return ring_openings(places, conditions)
+    return ring_openings(places, conditions, on)
 
 
 def no_potential(names: Sequence[str]) -> str:

@@ -38,6 +38,7 @@ class Supports:
     axial: Facets
     mirror: Facets
     named: Mapping[str, tuple[Facets, tuple[int, ...]]]
+    meridian: Meridian
 
     def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
         """Of the axisymmetric displacement (U, W)."""
@@ -53,11 +54,20 @@ class Supports:
 
         Of m = 0 the motion along e3 is 1, that around it is counted under -1. Each of m = 1 has a twin.
         """
-        # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
-        rows = [[1.0, z] for _, z in self._places(r0, self.horizontal)]
-        rows += [[0.0, rho] for rho, _ in self._places(r0, self.axial)]
-        stopped = np.linalg.matrix_rank(np.array(rows), tol=1e-9) if rows else 0
-        return {0: int(not len(self.axial)), -1: int(not len(self.horizontal)), 1: int(2 - stopped)}
+        free = {0: 0, -1: len(self.turning()), 1: 0}
+        for horizontal, axial in self._by_shell():
+            # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
+            rows = [[1.0, z] for _, z in self._places(r0, horizontal)]
+            rows += [[0.0, rho] for rho, _ in self._places(r0, axial)]
+            free[0] += not len(axial)
+            free[1] += 2 - int(np.linalg.matrix_rank(np.array(rows), tol=1e-9) if rows else 0)
+        return free
+
+    def turning(self) -> list[NDArray[np.bool_]]:
+        """The cells of each shell that no support keeps from turning about e3."""
+        every = np.ones(len(self.meridian.order), dtype=bool)
+        shells = [*self.meridian.patches.values()] or [every]
+        return [cells for cells, (horizontal, _) in zip(shells, self._by_shell(), strict=True) if not len(horizontal)]
 
     def free_motion(self, r0: fem.Function) -> str:
         """A rigid motion that is left free, as a message; empty if there is none. Nothing but supports holds it."""
@@ -65,8 +75,12 @@ class Supports:
         if free[0]:
             return NOT_HELD + "move along (0, 0, 1)"
         if free[1]:
-            return NOT_HELD + ("turn" if len(self.horizontal) else "move along (1, 0, 0)")
+            return NOT_HELD + ("move along (1, 0, 0)" if self.turning() else "turn")
         return ""
+
+    def _by_shell(self) -> list[tuple[Facets, Facets]]:
+        """Where the displacements of each shell normal to e3 and along e3 are zero."""
+        return list(zip(*map(self.meridian.by_shell, (self.horizontal, self.axial)), strict=True))
 
     @staticmethod
     def _places(r0: fem.Function, facets: Facets) -> NDArray[np.float64]:
@@ -85,7 +99,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
     named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
-        end = meridian.ends.get(name, meridian.axis)
+        end = meridian.ends[name] if name in meridian.ends else meridian.facets_at(name)
         held = set(condition.components) if isinstance(condition, Held) else set()
         if condition in ("clamped", "simply supported"):
             held = {*HORIZONTAL, AXIAL}
@@ -101,13 +115,13 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
         if both:
             named[name] = end, both
     parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
-    return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
+    return Supports(meridian.axis, parts[0], parts[1], parts[2], named, meridian)
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:
     """See that the surface crosses the plane of an end at right angles."""
-    s = meridian.parameter(name)
-    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
+    s, near = meridian.parameter(name), STRAIGHT if meridian.begins(name) else -STRAIGHT
+    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + near]))
     if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 WHOLE = "shell"
+KEEP_THICKNESS = ("koiter", "laminate")  # laws
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
 Pairs = Annotated[
     list[Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]],
@@ -71,11 +72,18 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
     key = "contact"
 
     def refuse_unfit(self, context: Context) -> None:
-        refuse_unfit_pairs(self.given, context, context.sections["symmetry"])
+        refuse_unfit_pairs(self.given, context)
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """All planes: a half sees its image."""
-        return [Leaves("contact: shells that may touch are modelled with their circumference")]
+        """All planes: a half sees its image. The meridian where shells of constant thickness touch each other."""
+        several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
+        names, laws = {name for pair in self.given for name in pair}, several.laws if several else {}
+        why = None
+        if not names <= {*laws} or any(one == other for one, other in self.given):
+            why = "contact: a shell that may touch itself is modelled with its circumference"
+        elif any(laws[name] not in KEEP_THICKNESS for name in names):
+            why = "contact: shells that get thinner as they stretch are modelled with their circumference"
+        return [Leaves(why)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
@@ -135,7 +143,7 @@ def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None
     return sum(found) / len(found) if found else 1.0
 
 
-def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetry: str | int) -> None:
+def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None:
     """See that a model can have these contacts.
 
     Raises
@@ -156,10 +164,6 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context, symmetr
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface", "the same thickness everywhere")
-    if symmetry == "axisymmetric":
-        raise ValueError(
-            "symmetry: axisymmetric: shells that may touch are modelled all around: take auto, half or none"
-        )
     for step in context.steps:
         _refuse_step(step, context)
     if context.sections.get("gradients"):

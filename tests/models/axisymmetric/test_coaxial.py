@@ -1,0 +1,218 @@
+"""Several shells with one axis on their meridians: each is as it is alone, pairs are as on surfaces, and they touch."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from along import csr
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.fields.gathering import RevolvedGatherer
+from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.simulate.follow import follow
+
+h = 0.02
+PRESSURE = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05, "points": 1}
+
+
+def cap(**shell: Any) -> dict[str, Any]:
+    """One of several shells."""
+    keys = {"geometry": "cap", "radius": 1, "polar": 30, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    return {"shell": keys | shell, "boundary": {"rim": "clamped"}}
+
+
+def placed(shell: dict[str, Any], z: float, polar: float = 180) -> dict[str, Any]:
+    """That shell with its origin at z; by default upside down."""
+    return shell | {"place": {"position": [0, 0, z], "axis": {"polar": polar}}}
+
+
+def end(data: dict[str, Any]) -> tuple[Scene, dict[str, float]]:
+    """The scene of a case, and what is observed at its end."""
+    scene = Scene(Case.from_source(data))
+    *_, last = follow(scene)
+    return scene, scene.observe(last.point.state)
+
+
+FLAW = {"kind": "formula", "w0": "0.1*z"}
+OWN = {"radius": 1.4, "thickness": 0.03, "hole": 4, "youngs_modulus": 2, "poisson_ratio": 0.4, "imperfections": [FLAW]}
+
+
+def test_far_apart() -> None:
+    """Each is as it is alone, whatever its place, side, size and material: path, ends and waves around, 1e-9."""
+    edge = {"points": {"edge": [1.4 * np.sin(np.radians(4)), 0, 1.4 * np.cos(np.radians(4))]}}
+    upper = cap(**OWN, density=3) | edge
+    both = {"shells": {"lower": cap(density=1), "upper": placed(upper, 9)}}
+    scene, seen = end(both | {"loading": PRESSURE | {"on": {"upper": "inside"}}})
+    assert scene.model.axisymmetric
+    assert {*scene.model.meridian.ends} == {"lower_rim", "upper_rim", "upper_hole"}
+    of_own = 2 * (0.03 / 1.4) ** 2 / (1 - 0.4**2) ** 0.5 / (h**2 / (1 - 0.3**2) ** 0.5)  # p_c over that of the first
+    alone, its = end(upper | {"loading": PRESSURE | {"pressure": -0.05 / of_own}})
+    for axis in "xz":  # turned about e2
+        assert seen[f"upper_edge_u{axis}"] == pytest.approx(-its[f"edge_u{axis}"], rel=1e-9)
+    assert abs(scene.model.displacement(scene.unloaded().u, "pole")).max() == 0
+    assert seen["volume_change"] == pytest.approx(-(1.4**3) * its["volume_change"], rel=1e-9)
+    first = Scene(Case.from_source(cap(density=1) | {"loading": PRESSURE}))
+    squares = [
+        [(m.eigenvalue, m.label) for m in ShellModes(each.model).vibrations(each.unloaded(), 8)]
+        for each in (scene, first, alone)
+    ]
+    unit = 2 / 3 / 1.4**2  # E/(rho R^2) over that of the first
+    separate = sorted(squares[1] + [(unit * value, label) for value, label in squares[2]])[:8]
+    for (value, label), (own, its_label) in zip(squares[0], separate, strict=True):
+        assert (value, label) == (pytest.approx(own, rel=1e-8), its_label)
+
+
+def test_pair_in_a_field() -> None:
+    """Tops and volume as of halves of both, whose mesh converges to that: 1e-3 (3.7e-3 on elements of 0.15)."""
+    lower = cap() | {"remanent": {"kind": "radial"}, "points": {"top": [0, 0, 1]}}
+    upper = placed(cap(**OWN) | {"remanent": {"polar": 0}, "points": {"edge": [0.09765906, 0, 1.39658967]}}, 3)
+    data = {
+        "shells": {"lower": lower, "upper": upper},
+        "magnetic": {"lambda_m": 0.004, "applied": {"polar": 0}},
+        "loading": PRESSURE | {"pressure": 0.3, "on": {"upper": "inside", "lower": "outside"}},
+    }
+    scene, seen = end(data)
+    assert scene.model.axisymmetric
+    half, other = end(data | {"symmetry": "half", "mesh": {"degree": 3, "size": 0.1}})
+    assert half.model.multiplicity == 2
+    for name in ("lower_top_uz", "upper_edge_uz", "volume_change", "magnetic"):
+        assert seen[name] == pytest.approx(other[name], rel=1e-3)
+
+
+def test_drawn() -> None:
+    """Triangles of both turn their outer side up, cover their areas, and have the numbers of their shells."""
+    data = {"shells": {"lower": cap(), "upper": placed(cap(radius=1.4, hole=4), 3)}, "loading": PRESSURE}
+    scene = Scene(Case.from_source(data))
+    surface = RevolvedGatherer(scene.model, scene.comm).gather(scene.unloaded().u, scene.unloaded().mu)
+    assert surface.shells == ("lower", "upper")
+    a, b, c = np.moveaxis(surface.r0[surface.cells], 1, 0)
+    normal = np.cross(b - a, c - a) / 2
+    assert (np.sum(normal * surface.n0[surface.cells].sum(axis=1), axis=1) > 0).all()
+    of = surface.fields["shell"][surface.cells[:, 0]]
+    areas = [np.linalg.norm(normal[of == i], axis=1).sum() for i in range(2)]
+    cosines = np.cos(np.radians([30, 4]))
+    exact = [2 * np.pi * (1 - cosines[0]), 2 * np.pi * 1.4**2 * (cosines[1] - cosines[0])]
+    assert areas == pytest.approx(exact, rel=3e-3)
+
+
+def touching(upper: dict[str, Any], z: float, load: dict[str, Any]) -> Scene:
+    """Two shells that may touch."""
+    shells = {"lower": cap(), "upper": placed(upper, z)}
+    return Scene(Case.from_source({"shells": shells, "contact": [["upper", "lower"]], "loading": load}))
+
+
+def pressed(scene: Scene, down: float) -> State:
+    """The upper shell pushed into the lower one, both bent a little."""
+    model, r = scene.model, scene.model.r0.x.array.reshape(-1, 2)
+    u = 1e-2 * h * np.sin(5 * r + 1)
+    u[np.unique(model.V.dofmap.list[model.meridian.patches["upper"]]), 1] -= down * h
+    return State(model.system.held(u.ravel()), scene.unloaded().mu)
+
+
+@pytest.mark.parametrize(("hole", "z"), [(None, 2 + 1.0001 * h), (6, np.cos(np.radians(6)) * 2 + 1.01 * h)])
+def test_contact_derivatives(hole: float | None, z: float) -> None:
+    """Residual and tangent by differences, face on face and an edge on a face; waves of m = 0 have half the tangent."""
+    upper = cap() if hole is None else cap(hole=hole)
+    scene = touching(upper, z, PRESSURE)
+    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
+    at = system.at(state)
+    assert at.of(contact.force) > 0
+    v = system.held(np.random.default_rng(1).standard_normal(state.u.size))
+    step = 1e-7 * h
+    ahead, back = (State(state.u + way * step * v, state.mu) for way in (1, -1))
+    energies = [sum(scene.energies(each).values()) for each in (ahead, back)]
+    residuals = [system.held(system.residual(each.u, each.mu)) for each in (ahead, back)]
+    slope = system.residual(state.u, state.mu) @ v
+    assert slope == pytest.approx((energies[0] - energies[1]) / (2 * step), rel=1e-6)
+    Kv = system.held(csr(system.tangent(state.u, state.mu)) @ v)
+    assert np.linalg.norm(Kv - (residuals[0] - residuals[1]) / (2 * step)) < 1e-6 * np.linalg.norm(Kv)
+    waves, plane = at.of(lambda: contact.entries_of_waves(0.0)), at.of(contact.entries)
+    n = state.u.size // 2
+    Q = scipy.sparse.coo_array((waves[2], waves[:2]), (3 * n, 3 * n))
+    K = scipy.sparse.coo_array((plane[2], plane[:2]), (2 * n, 2 * n))
+    wave = np.insert(v.reshape(-1, 2), 1, 0.0, axis=1).ravel()
+    assert wave @ Q @ wave == pytest.approx(v @ K @ v / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_waves_of_contact(m: int) -> None:
+    """The second variation along a wave is that of the distances of its points from the moved surface in space."""
+    scene = touching(cap(radius=1.3), 2.3 + 1.0001 * h, PRESSURE)
+    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
+    at = system.at(state)
+    faced, (H, nodes) = at.of(contact._pressed), at.of(lambda: contact._second(m))
+    r = scene.model.r0.x.array.reshape(-1, 2)
+    U, V, W = (100 * r[:, 0] ** 2 * np.cos(k * r[:, 0] + r[:, 1]) for k in (1, 2, 3))  # regular on the axis
+    some = range(0, len(faced.point), 5)
+    waves = np.column_stack([U, V, W])[nodes[some]].reshape(len(some), -1)
+    Q = np.einsum("na,nab,nb", waves, H[some], waves) / 2
+    nodal = np.column_stack([r + state.u.reshape(-1, 2), U, V, W])
+    element, cells = scene.model.V.element.basix_element, scene.model.V.dofmap.list
+    rule, k, size = contact._rule, contact.stiffness.value, contact._h
+
+    def moved(row: Any, theta: Any, e: float) -> Any:
+        rho, z, u, v, w = row
+        radial, around = rho + e * u * np.cos(m * theta), e * v * np.sin(m * theta)
+        cos, sin = np.cos(theta), np.sin(theta)
+        return np.array([radial * cos - around * sin, radial * sin + around * cos, z + e * w * np.cos(m * theta)])
+
+    def energy(e: float) -> float:
+        total, angles = 0.0, 2 * np.pi * (np.arange(2 * m + 1) + 0.3) / (2 * m + 1)
+        for point, cell, X in zip(faced.point[some], faced.cell[some], faced.X[some], strict=True):
+            own, its = rule.shape[point] @ nodal[cells[rule.cell[point]]], nodal[cells[cell]]
+            for theta in angles:
+                x = moved(own, theta, e)
+
+                def off(y: Any, x: Any = x, its: Any = its, theta: float = theta) -> Any:
+                    row = element.tabulate(0, np.array([[y[0]]]))[0, 0, :, 0] @ its
+                    return x - moved(row, theta + y[1], e)
+
+                near = scipy.optimize.least_squares(off, [X, 0.0], jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+                d = np.linalg.norm(near.fun)
+                total += rule.weight[point] / 2 * penalty(np.array(size - d), k, SOFT * size)[0] / len(angles)
+        return total
+
+    e = 1e-4 * h
+    second = (energy(e) - 2 * energy(0.0) + energy(-e)) / e**2
+    assert pytest.approx(second, rel=1e-3) == Q
+
+
+def test_messages() -> None:
+    """Why there is no meridian."""
+    beside = cap() | {"place": {"position": [3, 0, 0]}}
+    dented = cap(imperfections=[{"kind": "formula", "w0": "0.1*x"}])
+    for other, reason in (
+        (beside, r"shells.upper.place: its axis is not e3 through the origin"),
+        (dented, r"shells.upper.an imperfection differs around e3"),
+    ):
+        data = {"shells": {"lower": cap(), "upper": other}, "symmetry": "axisymmetric", "loading": PRESSURE}
+        with pytest.raises(CaseError, match=rf"symmetry: axisymmetric: {reason}"):
+            Case.from_source(data).problem()
+    shells = {"shells": {"lower": cap(), "upper": placed(cap(), 3)}, "symmetry": "axisymmetric", "loading": PRESSURE}
+    with pytest.raises(CaseError, match=r"symmetry: axisymmetric: contact: a shell that may touch itself is modelled"):
+        Case.from_source(shells | {"contact": [["lower", "lower"]]}).problem()
+    rubber = {name: cap(poisson_ratio=0.5, law="neo-hookean") for name in ("lower", "upper")}
+    rubber["upper"] = placed(rubber["upper"], 3)
+    with pytest.raises(CaseError, match=r"symmetry: axisymmetric: contact: shells that get thinner as they stretch"):
+        Case.from_source(shells | {"shells": rubber, "contact": [["lower", "upper"]]}).problem()
+
+
+@pytest.mark.slow
+def test_two_caps_are_one_on_a_plane() -> None:
+    """Pressed pole to pole each is as one on a rigid plane: F at one thickness to 1e-3."""
+
+    def moved(**moves: float) -> dict[str, Any]:
+        moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
+        return {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moving}
+
+    plane = {"kind": "plane", "position": [0, 0, 1 + h / 2], "direction": [0, 0, -1]}
+    _, one = end(cap(polar=40) | {"bodies": {"plane": plane}, "loading": moved(rim=1)})
+    shells = {"lower": cap(polar=40), "upper": placed(cap(polar=40), 2 + h)}
+    load = moved(lower_rim=1, upper_rim=-1)
+    two, seen = end({"shells": shells, "contact": [["upper", "lower"]], "loading": load})
+    assert two.model.axisymmetric
+    assert seen["contact_force"] * two.model.force_unit == pytest.approx(one["reaction"] / h, rel=1e-3)
