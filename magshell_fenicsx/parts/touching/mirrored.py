@@ -130,5 +130,9 @@ class Mirrored(Touching):
     def entries(self) -> Entries:
         return self._images.entries(super().entries())
 
+    def around(self) -> tuple[Longs, Longs]:
+        rows, columns = super().around()
+        return rows % self._images.count, columns % self._images.count
+
     def through(self, u: Array, v: Array) -> bool:
         return super().through(self._images.moved(u), self._images.moved(v))
