@@ -266,7 +266,7 @@ class Touching:
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
-            x = self._facing.x_of(self._points, self._r0 + self._now())[at.point[worst]]
+            x = self._facing.x_of(self._points, self._r0 + self._now(), at.point[[worst]])[0]
             mine = (float(self._h - at.distance[worst]), x)
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
