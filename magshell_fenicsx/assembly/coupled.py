@@ -22,7 +22,6 @@ from magshell_fenicsx.continuation.system import Beside
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
-WIDE = 2.0  # times the room that is needed: a pattern with more is given up
 Entries: TypeAlias = tuple[Longs, Longs, Array]  # global rows and columns, and values
 Factors: TypeAlias = Mapping[str, float]  # of terms, by name
 
@@ -90,7 +89,14 @@ class Coupled(Protocol):
         """This rank's part of d2Pi/du2, in any order; entries at the same place are added up. Collective."""
 
     def around(self) -> tuple[Longs, Longs]:
-        """Pairs of global nodes, in any order, between which this rank has entries now or soon. Collective."""
+        """Pairs of global nodes, in any order, between which this rank may have entries. Collective.
+
+        It is a function of `since`, and of nothing that was evaluated before: a resumed run has the same pattern.
+        """
+
+    @property
+    def since(self) -> float:
+        """A number of the present state that changes where `around` does."""
 
 
 class ChangingEntries:
@@ -106,9 +112,10 @@ class ChangingEntries:
             held[dofs[dofs < len(held)]] = True
         self._fixed = np.concatenate(self._comm.allgather(held))
         self._sum: _Sum | None = None
+        self._since: tuple[tuple[str, float], ...] = ()
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """See `Couplings`; K itself if there are no entries, else the same object while its pattern has room."""
+        """See `Couplings`; K itself if there are no entries, else mostly the same object."""
         entries = self._entries(factors)
         if not entries:
             return K
@@ -116,13 +123,12 @@ class ChangingEntries:
         added = self._owned(rows, columns, np.concatenate([factor * each[2] for factor, each in entries]))
         if not self._comm.allreduce(added.nnz):
             return K
-        if (
-            self._sum is None
-            or self._sum.of.handle != K.handle
-            or not self._comm.allreduce(self._sum.has(added), MPI.MIN)
-        ):
-            self._sum = _Sum(K, self._room(added, factors), self._own.start)
-        return self._sum.filled(added)
+        since = tuple((t.name, t.since) for t in self._terms if factors.get(t.name, 0.0))
+        if self._sum is None or self._since != since or self._sum.of.handle != K.handle:
+            self._sum, self._since = _Sum(K, self._room(factors), self._own.start), since
+        if self._comm.allreduce(self._sum.has(added), MPI.MIN):
+            return self._sum.filled(added)
+        return _Sum(K, _ones(added), self._own.start).filled(added)
 
     def times(self, v: Array, factors: Factors) -> Array:
         """See `Couplings`."""
@@ -146,19 +152,15 @@ class ChangingEntries:
         shape = self._own.stop - self._own.start, len(self._fixed)
         return coo_array((own[2], (own[0] - self._own.start, own[1])), shape).tocsr()
 
-    def _room(self, added: csr_array, factors: Factors) -> csr_array:
-        """The pattern of these entries and of those to come, and that of before while it is not much larger.
-        Collective."""
+    def _room(self, factors: Factors) -> csr_array:
+        """The pattern in which there is room. Collective."""
         parts = [t.around() for t in self._terms if factors.get(t.name, 0.0)]
         rows, columns = (np.concatenate(each) for each in zip(*parts, strict=True))
         count = len(self._fixed) // 3
         rows, columns = np.divmod(np.unique(rows * count + columns), count)
         i, j = (3 * each[:, None, None] + np.arange(3) for each in (rows, columns))
         i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
-        room = _ones(self._owned(i.ravel(), j.ravel(), np.ones(i.size, dtype=np.int8))) + _ones(added)
-        if self._sum is not None and self._comm.allreduce(self._sum.room.nnz) <= WIDE * self._comm.allreduce(room.nnz):
-            room = room + self._sum.room
-        return _ones(room)
+        return _ones(self._owned(i.ravel(), j.ravel(), np.ones(i.size, dtype=np.int8)))
 
 
 class _Sum:

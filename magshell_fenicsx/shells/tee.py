@@ -169,6 +169,11 @@ class Tee:
         """See `Coupled`: those that act on each other always do."""
         return pairs_of(self._nodes)
 
+    @property
+    def since(self) -> float:
+        """See `Coupled`."""
+        return 0.0
+
     # geometry
 
     def _gap(self, u: Array) -> Array:

@@ -358,6 +358,10 @@ class Cuts:
             self._latest = {**dict([*self._latest.items()][-1:]), number: self.at(at)}
         return self._latest[number]
 
+    def displacement(self, number: float) -> Array:
+        """That of a number of which there are points."""
+        return self._displacements[number]
+
     def at(self, u: Array) -> tuple[Points, Array]:
         """Those of a displacement."""
         return self._segments.points(self._near(u), self._r0 + u), self._segments.normals(self._r0 + u)

@@ -46,7 +46,7 @@ from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
-AHEAD = 0.5  # of the thickness: cells that near each other get room in the tangent
+AHEAD = 1.0  # of the thickness: cells that are nearer than that have room in the tangent
 CHUNK = 1000  # blocks of a tangent at a time
 ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
 PART = 0.25  # of the thickness: how far points move between two looks at a step
@@ -154,11 +154,16 @@ class Touching:
         entries = self._by_parts()
         return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
 
+    @property
+    def since(self) -> float:
+        """See `Coupled`: the number of the cuts."""
+        return self.cuts.value
+
     def around(self) -> tuple[Longs, Longs]:
-        """See `Coupled`: the nodes of cells that touch, or nearly do."""
+        """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
         self._pressed()
-        number, r = len(self._cells.nodes), self._facing.placed(self._at)
-        at = self._facing.places_in(self._points, self._at, r, (1 + AHEAD) * self._h)
+        number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
+        at = self._facing.places_in(self._points, u, self._facing.placed(u), (1 + AHEAD) * self._h)
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
