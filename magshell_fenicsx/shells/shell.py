@@ -57,6 +57,9 @@ from magshell_fenicsx.shells.observed import Thin
 from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.touching import Touching
+
 
 class ShellModel(Thin):
     """A Koiter shell on a mid-surface.
@@ -247,7 +250,7 @@ class ShellModel(Thin):
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
-        meeting: "Sequence[Touching]" = ()
+        meeting: Sequence[Touching] = ()
         if loads.pairs:
             from magshell_fenicsx.parts.touching.building import touchings
 

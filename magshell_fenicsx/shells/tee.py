@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
-from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values, whole_hessian
 from magshell_fenicsx.mesh.patch import MeshError, place_text
@@ -164,6 +164,15 @@ class Tee:
         dofs = (3 * self._nodes[:, :, None] + np.arange(3)).reshape(count, 3 * k)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
         return rows.ravel(), columns.ravel(), H.ravel()
+
+    def around(self) -> tuple[Longs, Longs]:
+        """See `Coupled`: those that act on each other always do."""
+        return pairs_of(self._nodes)
+
+    @property
+    def since(self) -> float:
+        """See `Coupled`."""
+        return 0.0
 
     # geometry
 

@@ -109,10 +109,11 @@ class Waves:
         """With the entries of contacts at a state."""
         if not self.touching:
             return K
-        entries = self._system.at(state).of(lambda: [(1.0, each.entries_of_waves(m)) for each in self.touching])
+        entries = self._system.at(state).of(lambda: [each.entries_of_waves(m) for each in self.touching])
+        rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
         fixed = np.zeros(K.getSize()[0], dtype=bool)
         fixed[self._rows(m)] = True
-        return with_entries(K, entries, fixed)
+        return with_entries(K, (rows, columns, values), fixed)
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
         """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi and m at a time."""

@@ -107,6 +107,19 @@ def test_the_tangent_holds_what_couples() -> None:
         assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
 
 
+def test_states_with_the_same_cuts_share_a_pattern() -> None:
+    """The matrix is one object, which is analysed once, and its values are of the state alone."""
+    system, mu, term = ring().model.system, ring().unloaded().mu, touching()
+    u, deeper = (flattened(half, 0.02) for half in (0.499, 0.498))
+    mu = mu | {term.pair.cuts: system.at(State(u, mu)).of(term.recut)}
+    K = system.tangent(u, mu)
+    first = K.getValuesCSR()[2]
+    assert system.tangent(deeper, mu).handle == K.handle
+    assert np.abs(K.getValuesCSR()[2] - first).max() > 1e-3 * np.abs(first).max()
+    assert system.tangent(u, mu).handle == K.handle
+    assert (K.getValuesCSR()[2] == first).all()
+
+
 @pytest.mark.parametrize(("law", "across"), [("koiter", 1), ("neo-hookean", 1), ("neo-hookean", 0)])
 def test_a_half_touches_its_image(law: str, across: int) -> None:
     """Walls that meet in the plane, or are pressed together across it: the energy and its variations, also by

@@ -148,6 +148,18 @@ class Faces:
         i, j, v = scipy.sparse.find(by_u.T @ K @ by_u + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
 
+    def around(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
+        """Pairs of nodes that act on each other, where places and thickness at pairs of nodes do."""
+        nodes, count = self._places, len(self._r0)
+        has = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+        cells = scipy.sparse.coo_array((np.ones(nodes.size), (has, nodes.ravel())), (len(nodes), count)).tocsr()
+        moves = scipy.sparse.coo_array((np.ones(nodes.size), (has, self._cells.nodes.ravel())), cells.shape).tocsr()
+        of_places = scipy.sparse.coo_array((np.ones(count), (np.arange(count), self._same)), (count, count)).tocsr()
+        by = scipy.sparse.eye_array(count) + of_places @ cells.T @ moves
+        acting = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
+        i, j = (by.T @ acting @ by).nonzero()
+        return i.astype(np.int64), j.astype(np.int64)
+
     def _volume(self, order: int = 0) -> Array:
         """(h/2) sum V at all nodes, or a derivative of it by the amplitude."""
         powers = np.polynomial.polynomial

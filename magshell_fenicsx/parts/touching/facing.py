@@ -5,6 +5,7 @@ A tree gives the cells that are near, which are kept while nodes move little; Ne
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -74,9 +75,10 @@ class Facing:
         r = self._r0 + u
         return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
 
-    def x_of(self, points: Points, r: Array) -> Array:
-        nodal = r[self._cells.nodes[points.cell]] * SIGNS[: r.shape[1]]
-        return np.asarray(np.einsum("nk,nki->ni", points.shape, nodal))
+    def x_of(self, points: Points, r: Array, which: Any = slice(None)) -> Array:
+        """The places of some points."""
+        nodal = r[self._cells.nodes[points.cell[which]]] * SIGNS[: r.shape[1]]
+        return np.asarray(np.einsum("nk,nki->ni", points.shape[which], nodal))
 
     def near_on_way(self, u: Array, v: Array) -> bool:
         """Whether any cells that may touch come near each other between two displacements; collective."""
@@ -87,11 +89,21 @@ class Facing:
         near = self._fit(*near_pairs(centres, radii, self._h))
         return bool(self._comm.allreduce(len(near[0])))
 
-    def _spheres(self, r: Array) -> tuple[Array, Array]:
-        """Centres and radii of spheres around all cells."""
-        nodal = r[self._cells.nodes]
+    def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
+        """Centres and radii of spheres around cells."""
+        nodal = r[self._cells.nodes[cell]]
         centres = nodal.mean(axis=1)
         return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+
+    def _slabs(self, r: Array, cell: Longs) -> tuple[Array, Array, Array]:
+        """Planes through the middle of cells, with their normals, and how far the cells are from these at most."""
+        nodal, corners = r[self._cells.nodes[cell]], self._cells.at_corners @ r[self._cells.nodes[cell]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+        height = np.einsum("nki,ni->nk", nodal - corners[:, :1], normal)
+        low, high = height.min(axis=1), height.max(axis=1)
+        middle = corners[:, 0] + ((low + high) / 2)[:, None] * normal
+        return np.asarray(middle), np.asarray(normal), np.asarray(self._cells.overshoot * (high - low) / 2)
 
     def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
         """The pairs of cells that may touch."""
@@ -127,14 +139,22 @@ class Facing:
         of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
         i, j = self._near_cells(u, reach)
         cells = self._cells
-        x, (centres, radii) = self.x_of(points, r), self._spheres(r[:, :3])
-        count = np.bincount(points.cell, minlength=len(cells.nodes))
-        order = np.argsort(points.cell, kind="stable")
-        firsts = np.concatenate([[0], np.cumsum(count)])
-        n = count[i]
+        order, cell_of = points.by_cell
+        first = np.searchsorted(cell_of, i)
+        n = np.searchsorted(cell_of, i, "right") - first
         within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        point, cell = order[np.repeat(firsts[i], n) + within], np.repeat(j, n)
-        close = np.linalg.norm(x[point, :3] - centres[cell], axis=1) < radii[cell] + reach
+        point, cell = order[np.repeat(first, n) + within], np.repeat(j, n)
+        asked = np.zeros(len(order), dtype=bool)
+        asked[point] = True
+        x = np.empty((len(order), r.shape[1]))
+        x[asked] = self.x_of(points, r, asked)
+        numbers = np.unique(cell)
+        number = np.searchsorted(numbers, cell)
+        centres, radii = self._spheres(r[:, :3], numbers)
+        middle, normal, deviation = self._slabs(r[:, :3], numbers)
+        off = x[point, :3]
+        close = np.linalg.norm(off - centres[number], axis=1) < radii[number] + reach
+        close &= np.abs(np.sum((off - middle[number]) * normal[number], axis=1)) < deviation[number] + reach
         point, cell = point[close], cell[close]
         if not len(point):
             return nowhere()
@@ -147,7 +167,7 @@ class Facing:
                 away = np.einsum("nmi,nmi->nm", off, off)
                 start[some] = away.argmin(axis=1)
                 least[some] = np.sqrt(away[np.arange(len(some)), start[some]])
-            close = least < reach + BETWEEN / parts * radii[cell]
+            close = least < reach + BETWEEN / parts * radii[np.searchsorted(numbers, cell)]
             point, cell, start = point[close], cell[close], start[close]
             if not len(point):
                 return nowhere()
@@ -175,7 +195,7 @@ class Facing:
             return at
         at = at.of(np.lexsort((at.distance, at.point)))
         (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        off = self.x_of(points, r)[at.point] - y
+        off = self.x_of(points, r, at.point) - y
         way, numbers = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
         rest = np.arange(len(off))
         for number_of_way in range(WAYS - 1):

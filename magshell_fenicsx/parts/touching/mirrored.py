@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.mesh.mirror import Image
-from magshell_fenicsx.parts.touching.nearest import CORNERS, Cells, Longs
+from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ class Images:
             Numbers of these vertices.
         """
         x = np.zeros((int(cells.corners.max()) + 1, 3))
-        x[cells.corners] = np.einsum("ck,nki->nci", cells.element.tabulate(0, CORNERS)[0, :, :, 0], r0[cells.nodes])
+        x[cells.corners] = cells.at_corners @ r0[cells.nodes]
         numbers = self.shared(x, on_planes)
         return Cells(
             cells.element,
@@ -129,6 +129,10 @@ class Mirrored(Touching):
 
     def entries(self) -> Entries:
         return self._images.entries(super().entries())
+
+    def around(self) -> tuple[Longs, Longs]:
+        rows, columns = super().around()
+        return rows % self._images.count, columns % self._images.count
 
     def through(self, u: Array, v: Array) -> bool:
         return super().through(self._images.moved(u), self._images.moved(v))

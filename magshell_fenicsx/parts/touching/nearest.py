@@ -79,6 +79,17 @@ class Cells:
         spread = [np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n for n in LATTICES]
         return [(X, self.element.tabulate(0, X)[0, :, :, 0]) for X in spread]
 
+    @cached_property
+    def at_corners(self) -> Array:
+        """Shape functions (3, functions) at the corners."""
+        return np.asarray(self.element.tabulate(0, CORNERS)[0, :, :, 0])
+
+    @cached_property
+    def overshoot(self) -> float:
+        """The largest value in a cell of what is at most 1 at its nodes (Lebesgue's constant)."""
+        _, fine = self.lattices[-1]
+        return float(np.abs(fine).sum(axis=1).max())
+
     def near_in_surface(self, r0: Array, far: float) -> Longs:
         """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than `far`.
 
@@ -88,8 +99,8 @@ class Cells:
             (nodes, 3) undeformed.
         """
         count, n = int(self.corners.max()) + 1, len(self.corners)
-        x, at = np.zeros((count, 3)), self.element.tabulate(0, CORNERS)[0, :, :, 0]
-        x[self.corners] = np.einsum("ck,nki->nci", at, r0[self.nodes])
+        x = np.zeros((count, 3))
+        x[self.corners] = self.at_corners @ r0[self.nodes]
         a, b = (np.concatenate([self.corners[:, c] for c in of]) for of in ((0, 1, 2), (1, 2, 0)))
         ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
         ways = ways.tocoo()
@@ -215,7 +226,7 @@ def _convex(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Arra
     (_, y), (_, y1), (_, y2), (_, y11), (_, y12), (_, y22) = jets(cells.element, X, nodal)
     g, A = slopes(straight(x - y), y1, y2, y11, y12, y22)
     plane = slopes(0 * y, y1, y2, y11, y12, y22)[1]
-    bent = (np.linalg.det(A) < FLAT * np.linalg.det(plane)) | (np.trace(A, axis1=1, axis2=2) <= 0)
+    bent = (determinant(A) < FLAT * determinant(plane)) | (np.trace(A, axis1=1, axis2=2) <= 0)
     return g, np.where(bent[:, None, None], plane, A)
 
 
@@ -274,7 +285,13 @@ def inverse(free: Array, A: Array) -> Array:
     reduced = np.einsum("nji,njk,nkl->nil", free, A, free)
     reduced[:, 0, 0] += none[:, 0]
     reduced[:, 1, 1] += none[:, 1]
-    return np.asarray(np.linalg.inv(reduced))
+    turned = np.stack([reduced[:, 1, 1], -reduced[:, 0, 1], -reduced[:, 1, 0], reduced[:, 0, 0]], axis=1)
+    return np.asarray(turned.reshape(-1, 2, 2) / determinant(reduced)[:, None, None])
+
+
+def determinant(A: Array) -> Array:
+    """Of (n, 2, 2)."""
+    return np.asarray(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
 
 
 def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs]:

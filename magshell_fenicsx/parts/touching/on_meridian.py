@@ -12,13 +12,14 @@ rule on each cell. At a free end one is next to the end, which an edge stands on
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from zlib import crc32
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
-from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
@@ -132,8 +133,7 @@ class MeridianTouching:
     def compile_residual(self) -> None:
         """It has no forms."""
 
-    def compile_tangent(self) -> None:
-        """It has no forms."""
+    compile_tangent = compile_residual
 
     def energy(self) -> float:
         """Of the whole shell."""
@@ -156,6 +156,20 @@ class MeridianTouching:
         H, nodes = self._second(0.0)
         of_plane = np.flatnonzero(np.arange(H.shape[1]) % 3 != 1)
         return _entries(H[:, of_plane[:, None], of_plane], nodes, 2)
+
+    @property
+    def since(self) -> float:
+        """See `Coupled`: a number of the cells that touch."""
+        return float(crc32(self._touching_cells().tobytes()))
+
+    def around(self) -> tuple[Longs, Longs]:
+        """See `Coupled`: the nodes of cells that touch."""
+        nodes = self._nodes[self._touching_cells()]
+        return pairs_of(nodes.reshape(len(nodes), 2 * self._nodes.shape[1]))
+
+    def _touching_cells(self) -> Longs:
+        at = self._pressed()
+        return np.unique(np.column_stack([self._rule.cell[at.point], at.cell]), axis=0)
 
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""

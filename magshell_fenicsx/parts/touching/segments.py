@@ -14,6 +14,7 @@ need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import basix
 import numpy as np
@@ -59,6 +60,12 @@ class Points:
     weight: Array
     faces: Longs
     on_edge: Inside
+
+    @cached_property
+    def by_cell(self) -> tuple[Longs, Longs]:
+        """Their order by cells, and these cells."""
+        order = np.argsort(self.cell, kind="stable")
+        return order, self.cell[order]
 
     def of(self, which: Inside) -> "Points":
         """Some of them."""
@@ -264,7 +271,6 @@ class Segments:
     def __init__(self, cells: Cells, own: Longs, r0: Array, degrees: tuple[int, int]) -> None:
         self._cells, self._r0 = cells, r0
         self._rules = [(inner_rule(degree), ending_rule(degree)) for degree in degrees]
-        self._at_corners = cells.element.tabulate(0, CORNERS)[0, :, :, 0]
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         far = [covers(X) for X, _ in self._rules[0]]
@@ -316,7 +322,7 @@ class Segments:
         return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
 
     def _corners(self, r: Array, cell: Longs) -> Array:
-        return np.asarray(np.einsum("ck,nki->nci", self._at_corners, r[self._cells.nodes[cell]]))
+        return np.asarray(self._cells.at_corners @ r[self._cells.nodes[cell]])
 
     def _projected(self, one: Longs, other: Longs, r: Array) -> Array:
         """The corners (n, 3, 2) of cells in reference cells of others, along the normals of these."""
@@ -351,6 +357,10 @@ class Cuts:
             at = self._displacements.setdefault(number, np.array(u))
             self._latest = {**dict([*self._latest.items()][-1:]), number: self.at(at)}
         return self._latest[number]
+
+    def displacement(self, number: float) -> Array:
+        """That of a number of which there are points."""
+        return self._displacements[number]
 
     def at(self, u: Array) -> tuple[Points, Array]:
         """Those of a displacement."""

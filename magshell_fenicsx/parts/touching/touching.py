@@ -26,7 +26,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import add_own
-from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
@@ -46,6 +46,7 @@ from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
+AHEAD = 1.0  # of the thickness: cells that are nearer than that have room in the tangent
 CHUNK = 1000  # blocks of a tangent at a time
 ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
 PART = 0.25  # of the thickness: how far points move between two looks at a step
@@ -153,6 +154,20 @@ class Touching:
         entries = self._by_parts()
         return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
 
+    @property
+    def since(self) -> float:
+        """See `Coupled`: the number of the cuts."""
+        return self.cuts.value
+
+    def around(self) -> tuple[Longs, Longs]:
+        """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
+        self._pressed()
+        number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
+        at = self._facing.places_in(self._points, u, self._facing.placed(u), (1 + AHEAD) * self._h)
+        keys = np.unique(self._points.cell[at.point] * number + at.cell)
+        nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
+        return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
+
     # by what grows
 
     def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
@@ -256,7 +271,7 @@ class Touching:
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
-            x = self._facing.x_of(self._points, self._r0 + self._now())[at.point[worst]]
+            x = self._facing.x_of(self._points, self._r0 + self._now(), at.point[[worst]])[0]
             mine = (float(self._h - at.distance[worst]), x)
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
