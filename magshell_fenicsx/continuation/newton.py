@@ -17,6 +17,8 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.snes import HIDDEN, IN_WORDS, Linearised, NewtonOptions, Tangents, make_snes
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
 
+SOFTER = 1e-3, 3e-2, 1.0  # of a penalty, one after the other, where full steps fail
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -95,12 +97,28 @@ class BorderedNewton:
         stress
             As that of `System.tangent`, of the guess.
         search
-            Whether a line search is tried where full steps fail and forces set in within a step.
+            Whether softer penalties, then a line search are tried where full steps fail and forces set in.
         """
         outcome = self._solved(self._snes, guess, name, row, stress)
-        if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
-            again = self._solved(self._searching, guess, name, row, stress)
-            return again if again.converged else outcome
+        if not (search and self._searching) or outcome.converged or outcome.reason == HIDDEN:
+            return outcome
+        softly = self._softly(guess, name, row)
+        if softly and softly.converged:
+            return softly
+        again = self._solved(self._searching, guess, name, row, stress)
+        return again if again.converged else outcome
+
+    def _softly(self, guess: State, name: str, row: Row) -> Outcome | None:
+        """The equilibrium near those of softer penalties, each the guess of the next; None if one has none."""
+        outcome, stiff = None, {each: guess.mu[each] for each in self.options.penalties if each in guess.mu}
+        for part in SOFTER if stiff else ():
+            soft = State(guess.u, {**guess.mu, **{each: part * k for each, k in stiff.items()}})
+            outcome = self._solved(self._snes, soft, name, row, ())
+            if not outcome.converged and part < 1:
+                outcome = self._solved(self._searching, soft, name, row, ())
+            if not outcome.converged:
+                return None
+            guess = outcome.state
         return outcome
 
     def _solved(self, snes: Any, guess: State, name: str, row: Row, stress: Sequence[Weighted]) -> Outcome:

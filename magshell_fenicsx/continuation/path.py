@@ -121,6 +121,7 @@ class Path:
         self._hard = 0  # number of solves that failed or took many matrices
         self._vain = 0  # number of solves that failed, one after the other
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
+        self._near: Point | None = None  # a point of the same path with other amplitudes beside that of the path
 
     def start(self, state: State, sense: float = 1.0) -> Point:
         """The first point of a path, from a state in equilibrium.
@@ -346,7 +347,10 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        point = self.at(s, self._extended(s, passed), here)
+        near, self._near = self._near, None
+        point = self.at(s, here.state.with_(near.state.u, self.name, near.state.mu[self.name]), here) if near else ""
+        if isinstance(point, str):
+            point = self.at(s, self._extended(s, passed), here)
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
@@ -425,8 +429,8 @@ class Path:
         held = pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)
         return Point(state, s, response.du, response.dmu, pivots, held)
 
-    def in_steps(self, options: StepOptions) -> "Path":
-        """The same path with other step lengths."""
+    def in_steps(self, options: StepOptions, near: Point | None = None) -> "Path":
+        """The same path with other step lengths; its first step may end near a known point of another path."""
         other = copy(self)
-        other.options = options
+        other.options, other._near = options, near
         return other

@@ -73,8 +73,9 @@ class NewtonOptions:
         An iteration that moves u by more than this many lengths counts as divergence.
     patience
         Matrices after which the steps of a solve must have shrunk.
-    kinks
-        Whether forces set in within a step, as where shells touch: full steps then circle, and a path has corners.
+    penalties
+        The amplitudes that are stiffnesses of shells that touch: forces then set in within a step, full steps circle,
+        and a path has corners.
     """
 
     tolerance: float = 1e-9
@@ -85,7 +86,12 @@ class NewtonOptions:
     fresh: float = 0.05
     largest_step: float = 1e4
     patience: int = 4
-    kinks: bool = False
+    penalties: tuple[str, ...] = ()
+
+    @property
+    def kinks(self) -> bool:
+        """Whether forces set in within a step."""
+        return bool(self.penalties)
 
 
 class Tangents:

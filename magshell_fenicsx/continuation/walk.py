@@ -351,20 +351,24 @@ class Walk:
         PathStopped
             If the path is lost, returns to a fold that it has passed, or needs more steps than allowed.
         """
-        options, shorter, why = self.path.options, None, ""
+        options, shorter, near, why = self.path.options, None, None, ""
         while True:
             for point, reached in self.path.towards(self.points[-1], self._ahead()):
-                low, shorter = self.points[-1], None
+                low, shorter, near = self.points[-1], None, None
                 try:
                     state = self._renew(low, point) if self._renew else None
+                    while state:
+                        try:
+                            self.points[-1], shorter, near = self.path.renewed(low, state), abs(point.s - low.s), point
+                            break
+                        except PathStopped as e:
+                            why, asked = str(e), state
+                        state = self._renew(low, point) if self._renew else None
+                        if state and state.mu == asked.mu:  # nearer to the first point the change is smaller
+                            raise StepTooLong(why)
                 except StepTooLong as e:
                     shorter, why = abs(point.s - low.s) / 4, str(e)
-                    break
-                if state:
-                    try:
-                        self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
-                    except PathStopped as e:  # nearer to the first point the change is smaller
-                        shorter, why = abs(point.s - low.s) / 4, str(e)
+                if shorter is not None:
                     break
                 try:
                     between = self._between(low, point)
@@ -391,7 +395,7 @@ class Walk:
                 return
             if shorter < options.smallest:
                 raise PathStopped(why, self.points[-1])
-            self.path = self.path.in_steps(replace(options, first=shorter))
+            self.path = self.path.in_steps(replace(options, first=shorter), near)
 
     def _refuse_loop(self, fold: Point) -> None:
         """Stop at a fold that was passed before. Two successive folds may be close, so the last one is not compared."""

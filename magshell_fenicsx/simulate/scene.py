@@ -151,8 +151,9 @@ class Scene:
             raise MeshError(motion)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
-        touches = bool(self.model.touchings)
-        options = NewtonOptions(fresh=0.0, patience=7, kinks=touches) if self.model.contacts or touches else None
+        penalties = tuple(each.pair.setting for each in self.model.touchings)
+        presses = self.model.contacts or penalties
+        options = NewtonOptions(fresh=0.0, patience=7, penalties=penalties) if presses else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()

@@ -18,6 +18,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import recut, refuse_crossing, refuse_passing, refuse_return, stiffer
 
+COARSE = 1e-3  # of the first step under load control: shorter ones are tried in contact where no fold is near
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
 
@@ -61,17 +62,25 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     """A walk on which bodies become stiffer and shells are cut anew; magnets on the way and returning bodies end it."""
 
     cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
+    offered, vain, rest = dict[str, float](), 0, 0  # the last cuts, how many were in vain, points until the next
 
     def checked(low: Point, high: Point) -> State | None:
-        nonlocal cut_at
+        nonlocal cut_at, offered, vain, rest
         refuse_crossing(stage, low, high)
         refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
         if (raised := stiffer(stage, low, high)) or low.s == cut_at:  # slid points are better than none
             return raised
-        cut_at = low.s
-        return recut(stage, low, high)
+        if offered:
+            vain = 0 if offered.items() <= low.state.mu.items() else vain + 1
+            offered, rest = {}, 2**vain - 1
+        if rest:
+            rest -= 1
+            return None
+        cut_at, cut = low.s, recut(stage, low, high)
+        offered = {name: cut.mu[name] for name in cut.mu if cut.mu[name] != low.state.mu.get(name)} if cut else {}
+        return cut
 
     walk = Walk(path, start, goal, checked)  # which `checked` looks at
     return walk
@@ -82,6 +91,9 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
     crossing, fold, lost, watch = None, "", "", stage.scene.watch
+    finest, ahead = path.options, list[Record]()
+    if path.control == "load" and goal.targets and stage.newton.options.kinks:
+        path = walk.path = path.in_steps(replace(finest, smallest=max(finest.smallest, COARSE * finest.first)))
     furthest = np.inf  # amplitude, once an excluded mode is unstable
     for applied in stage.scene.model.fields:
         applied.lost = ""
@@ -112,6 +124,11 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         except PathStopped as e:
             lost = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere()
             onward = None if e.final else _onward(stage, walk)
+            if walk.path.options.smallest > finest.smallest and not e.final:
+                ahead = _fold_ahead(stage, path, walk.points)
+                if not ahead:
+                    fine = path.in_steps(replace(finest, first=COARSE * finest.first))
+                    onward = _walk(stage, fine, walk.points[-1], goal)
         excluded = list(_excluded(path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]
@@ -121,11 +138,12 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         if excluded and goal.until == "limit":
             furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
         if onward:
-            stage.scene.progress.doing("going on by arc length")
+            by = "by arc length" if onward.path.control == "arc" else "in shorter steps"
+            stage.scene.progress.doing(f"going on {by}")
             lost = ""
             watch.begin(onward.path, onward.points[0], stage.leave)
     if lost and path.control == "load" and goal.targets:
-        for record in _fold_ahead(stage, path, walk.points):
+        for record in ahead or _fold_ahead(stage, path, walk.points):
             yield record
             if record.label == "fold":
                 at = amount(stage.scene, path.name, record.point.state.mu[path.name])
