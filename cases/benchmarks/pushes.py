@@ -175,7 +175,7 @@ def motion(seed: int) -> dict[str, Any]:
         "point": [float(x) for x in point],
         "angle": float(rng.uniform(180, 300 if is_sheet else 240)),
     }
-    moved = [0.0, float(rng.uniform(-far, far)), float(h * (rng.uniform(-12, -4) if is_sheet else rng.uniform(-3, 0)))]
+    moved = [0.0, float(rng.uniform(-far, far)), float(h * (rng.uniform(-8, -2) if is_sheet else rng.uniform(-3, 0)))]
     return {"supports": ["right"], "rotation": turn, "translation": moved}
 
 

@@ -26,7 +26,10 @@ LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with w
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
-VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
+DEAR, VAIN = (
+    2,
+    6,
+)  # failures one after the other, from which on softer penalties and a line search are tried, and no more
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -140,16 +143,18 @@ class Path:
             s, rate = self.value(self.control, state), 1.0 if self.control == "load" else response.softness
         return self._point(state, s, response).per(rate)
 
-    def at(self, s: float, guess: State, base: Point) -> Point | str:
+    def at(self, s: float, guess: State, base: Point, *, search: bool = True) -> Point | str:
         """The point at `s`, or the reason why the solve failed.
 
         Parameters
         ----------
         base
             Arc length is measured from this point, along its tangent.
+        search
+            As of `BorderedNewton.solve`.
         """
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
-        return self.solve(self._row(s, base), s, guess, stress)
+        return self.solve(self._row(s, base), s, guess, stress, search=search)
 
     def inside(self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True) -> Point | str:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
@@ -171,13 +176,21 @@ class Path:
         return self.as_base(again)
 
     def solve(
-        self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = (), *, counted: bool = True
+        self,
+        row: Row,
+        s: float,
+        guess: State,
+        stress: Sequence[Weighted] = (),
+        *,
+        counted: bool = True,
+        search: bool = True,
     ) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
 
         Unless it shall be `counted`, its number of unstable directions means nothing.
         """
-        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted))
+        search = search and self._vain < VAIN  # a path that ends has no point ahead
+        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted, search))
         self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
@@ -347,10 +360,11 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        near, self._near = self._near, None
-        point = self.at(s, here.state.with_(near.state.u, self.name, near.state.mu[self.name]), here) if near else ""
-        if isinstance(point, str):
-            point = self.at(s, self._extended(s, passed), here)
+        near, self._near, point = self._near, None, ""
+        if near:
+            point = self.at(s, here.state.with_(near.state.u, self.name, near.state.mu[self.name]), here)
+        if isinstance(point, str):  # a shorter step is tried first: it is cheaper
+            point = self.at(s, self._extended(s, passed), here, search=self._vain >= DEAR)
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
@@ -395,9 +409,11 @@ class Path:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
-    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool) -> Point | str:
+    def _solve(
+        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool, search: bool
+    ) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN)
+        outcome = self.newton.solve(guess, self.name, row, stress, search=search)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before

@@ -20,6 +20,7 @@ from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed, off_path
 
 LOCATED = ("fold", "bifurcation")
+CREEPING = 1e-4  # of the first step: load control of shells that touch, if it needs shorter ones, is at a fold or lost
 
 
 def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
@@ -47,6 +48,9 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     for finer in (course.finer, along_contact if scene.model.touchings else None):
         path = path.in_steps(finer(path.options)) if finer else path
+    if scene.model.touchings and drive.control == "load":
+        options = path.options
+        path = path.in_steps(replace(options, smallest=max(options.smallest, CREEPING * options.first)))
     if drive.end is not None and not drive.targets and course.until == "target":  # it is there
         yield Record("target", step.name, stage.point(start))
         return state

@@ -18,7 +18,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import recut, refuse_crossing, refuse_passing, refuse_return, stiffer
 
-COARSE = 1e-3  # of the first step under load control: shorter ones are tried in contact where no fold is near
+NEAREST = 1e-3  # of the first step by arc length, in contact: a fold nearer to where a path stopped is not looked for
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
 
@@ -91,9 +91,6 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
     crossing, fold, lost, watch = None, "", "", stage.scene.watch
-    finest, ahead = path.options, list[Record]()
-    if path.control == "load" and goal.targets and stage.newton.options.kinks:
-        path = walk.path = path.in_steps(replace(finest, smallest=max(finest.smallest, COARSE * finest.first)))
     furthest = np.inf  # amplitude, once an excluded mode is unstable
     for applied in stage.scene.model.fields:
         applied.lost = ""
@@ -124,11 +121,6 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         except PathStopped as e:
             lost = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere()
             onward = None if e.final else _onward(stage, walk)
-            if walk.path.options.smallest > finest.smallest and not e.final:
-                ahead = _fold_ahead(stage, path, walk.points)
-                if not ahead:
-                    fine = path.in_steps(replace(finest, first=COARSE * finest.first))
-                    onward = _walk(stage, fine, walk.points[-1], goal)
         excluded = list(_excluded(path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]
@@ -138,12 +130,11 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         if excluded and goal.until == "limit":
             furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
         if onward:
-            by = "by arc length" if onward.path.control == "arc" else "in shorter steps"
-            stage.scene.progress.doing(f"going on {by}")
+            stage.scene.progress.doing("going on by arc length")
             lost = ""
             watch.begin(onward.path, onward.points[0], stage.leave)
     if lost and path.control == "load" and goal.targets:
-        for record in ahead or _fold_ahead(stage, path, walk.points):
+        for record in _fold_ahead(stage, path, walk.points):
             yield record
             if record.label == "fold":
                 at = amount(stage.scene, path.name, record.point.state.mu[path.name])
@@ -227,6 +218,9 @@ def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
     """The fold that ended a path under load control, located by arc length, after any excluded instabilities."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
     by_arc, start = stage.resume(path.name, "arc", points[-1].state, onward, path.metric.scale)
+    options = by_arc.options
+    if stage.newton.options.kinks:
+        by_arc = by_arc.in_steps(replace(options, smallest=NEAREST * options.first))
     stage.scene.watch.begin(by_arc, start, stage.leave)
     passed: list[Record] = []
     try:
