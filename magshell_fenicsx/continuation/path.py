@@ -360,9 +360,9 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        near, self._near, point = self._near, None, ""
-        if near:
-            point = self.at(s, here.state.with_(near.state.u, self.name, near.state.mu[self.name]), here)
+        near, self._near = self._near, None
+        there = near and here.state.with_(near.state.u, self.name, near.state.mu[self.name])
+        point = self.at(s, there, here) if there else ""
         if isinstance(point, str):  # a shorter step is tried first: it is cheaper
             point = self.at(s, self._extended(s, passed), here, search=self._vain >= DEAR)
         if isinstance(point, str):
