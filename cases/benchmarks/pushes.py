@@ -3,7 +3,7 @@ gap, and how often the shell intersects itself at an accepted point, by an indep
 
 A line for each push in the table; those that it has are not done again. At the end their counts.
 
-python3 cases/benchmarks/pushes.py [--pushes 200] [--first 0] [--table pushes.csv]
+PYTHONPATH=cases python3 -m benchmarks.pushes [--pushes 200] [--first 0] [--table pushes.csv]
 """
 
 import argparse
