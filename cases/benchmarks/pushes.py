@@ -1,19 +1,25 @@
-"""Random pushes of a sheet that folds on itself: how often it intersects itself at an accepted point, by an independent
-test of triangles. A line for each push; those in the table are not done again.
+"""Random pushes of a sheet that folds on itself and of a disc that crumples: where each stops and why, the smallest
+gap, and how often the shell intersects itself at an accepted point, by an independent test of triangles.
 
-python3 cases/benchmarks/pushes.py [--pushes 200] [--first 0] [--table pushes.csv]
+A line for each push in the table; those that it has are not done again. At the end their counts.
+
+PYTHONPATH=cases python3 -m benchmarks.pushes [--pushes 200] [--first 0] [--table pushes.csv]
 """
 
 import argparse
 import csv
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
@@ -21,8 +27,14 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 h, WIDTH, CELLS = 0.03, 0.25, 8  # thickness, width and cells along a sheet of unit length
-PARTS = 8  # of a cell's side, for the test of triangles
+RADIUS, RINGS = 0.4, 2  # of a disc
+SHEETS = 150  # the pushes before this one are of sheets
+PARTS = 8  # of a side of a cell, for the test of triangles
+NEAR = 1.5 * h  # between mid-surfaces: farther triangles are not looked at
+APART = 5 * h  # within the undeformed shell: nearer triangles are of one fold
+FOLD = "load control cannot pass the fold"  # how a stop is explained by a limit point
 
 
 @dataclass(frozen=True)
@@ -31,133 +43,197 @@ class Push:
 
     Attributes
     ----------
-    points, touching
-        How many were accepted, and at how many of them the sheet touches itself.
-    crossings
-        Sides of triangles that pass through others, of all points.
     factor
         The part of the motion that was reached.
-    stopped
-        Why it is no more; empty if it is all.
+    why
+        It stopped there: "target" is all of it, "fold" a limit point of the load, "failed" what is not explained.
+    points, touching
+        How many were accepted, and at how many of them the shell touches itself.
+    gap
+        The smallest between faces, over h, of all points; nan if none is near. Triangles are flat, which makes
+        it wrong by up to some hundredths.
+    intersections
+        Pairs of triangles that pass through each other, of all points.
+    said
+        The message, if it failed.
     """
 
-    seed: int
+    push: int
+    kind: str
+    factor: float
+    why: str
     points: int
     touching: int
-    crossings: int
-    factor: float
+    gap: float
+    intersections: int
     seconds: float
-    stopped: str
+    said: str
 
 
-def crossings(one: Array, other: Array, apart: NDArray[np.bool_] | None = None) -> int:
-    """How many sides of triangles (n, 3, 3) pass through other triangles (m, 3, 3), of the pairs (n, m) that count."""
-    found = 0
-    for a, b, counts in ((one, other, apart), (other, one, None if apart is None else apart.T)):
-        p = a.reshape(-1, 1, 3)
-        d = a[:, [1, 2, 0]].reshape(-1, 1, 3) - p
-        e1, e2 = b[None, :, 1] - b[None, :, 0], b[None, :, 2] - b[None, :, 0]
-        normal = np.cross(d, e2)
-        det = np.sum(normal * e1, axis=-1)
+def passing(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether a side of one of two triangles (n, 3, 3) passes through the other one."""
+    found = np.zeros(len(one), dtype=bool)
+    for a, b in ((one, other), (other, one)):
+        e1, e2 = (b[:, None, k] - b[:, None, 0] for k in (1, 2))
+        d, s = a[:, [1, 2, 0]] - a, a - b[:, None, 0]
+        normal, q = np.cross(d, e2), np.cross(s, e1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            s = p - b[None, :, 0]
-            u = np.sum(s * normal, axis=-1) / det
-            q = np.cross(s, e1)
-            v = np.sum(q * d, axis=-1) / det
-            t = np.sum(q * e2, axis=-1) / det
-            inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
-        found += int(np.sum(inside if counts is None else inside & np.repeat(counts, 3, axis=0)))
+            u, v, t = (np.sum(x * y, axis=-1) / np.sum(normal * e1, axis=-1) for x, y in ((s, normal), (q, d), (q, e2)))
+            found |= ((u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)).any(axis=1)
     return found
 
 
-def triangles(scene: Scene, u: Array, cells: NDArray[np.int32]) -> Array:
-    """Flat triangles (n, 3, 3), `PARTS`^2 of each of some cells (cells, functions)."""
+def distances(one: Array, other: Array) -> Array:
+    """Of two triangles (n, 3, 3) that do not pass through each other, without sides of no length."""
+    least = np.full(len(one), np.inf)
+    for i, j in product(range(3), range(3)):  # two sides
+        p, q, d, e = one[:, i], other[:, j], one[:, i - 1] - one[:, i], other[:, j - 1] - other[:, j]
+        dd, ee, de, r = *(np.sum(x * y, axis=1) for x, y in ((d, d), (e, e), (d, e))), p - q
+        square = np.maximum(dd * ee - de**2, 1e-12 * dd * ee)
+        s = np.clip((de * np.sum(e * r, axis=1) - ee * np.sum(d * r, axis=1)) / square, 0, 1)
+        t = np.clip((de * s + np.sum(e * r, axis=1)) / ee, 0, 1)
+        s = np.clip((de * t - np.sum(d * r, axis=1)) / dd, 0, 1)
+        least = np.minimum(least, np.linalg.norm(r + s[:, None] * d - t[:, None] * e, axis=1))
+    for a, b in ((one, other), (other, one)):  # a corner above the other one's plane
+        sides = np.stack([b[:, 1] - b[:, 0], b[:, 2] - b[:, 0]], axis=1)
+        normal = np.cross(sides[:, 0], sides[:, 1])
+        r = a - b[:, :1]
+        X = np.einsum("nki,nil->nkl", r, np.linalg.pinv(sides))
+        above = (X >= 0).all(axis=2) & (X.sum(axis=2) <= 1)
+        away = np.abs(np.einsum("nki,ni->nk", r, normal / np.linalg.norm(normal, axis=1)[:, None]))
+        least = np.minimum(least, np.where(above, away, np.inf).min(axis=1))
+    return least
+
+
+def triangles(scene: Scene, u: Array) -> Array:
+    """Flat triangles (n, 3, 3) of the deformed mid-surface, `PARTS`^2 of each cell."""
     model, n = scene.model, PARTS
-    X = np.array([(i, j) for j in range(n + 1) for i in range(n + 1 - j)]) / n
-    number = {(i, j): k for k, (i, j) in enumerate((i, j) for j in range(n + 1) for i in range(n + 1 - j))}
+    places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]
+    number = {place: k for k, place in enumerate(places)}
     low = [(number[i, j], number[i + 1, j], number[i, j + 1]) for j in range(n) for i in range(n - j)]
     high = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for j in range(n) for i in range(n - j - 1)]
-    shape = model.V.element.basix_element.tabulate(0, X)[0, :, :, 0]
-    r = (model.r0.x.array + u).reshape(-1, 3)[cells]
+    shape = model.V.element.basix_element.tabulate(0, np.array(places) / n)[0, :, :, 0]
+    r = (model.r0.x.array + u).reshape(-1, 3)[model.V.dofmap.list]
     return np.asarray(np.einsum("mk,nki->nmi", shape, r)[:, low + high].reshape(-1, 3, 3))
 
 
-def sheet(file: Path) -> Path:
-    """A mesh file of a sheet with the edges left and right, and the rest of its edge."""
-    x = np.linspace(0, 1, CELLS + 1)
-    nodes = [(a, b, 0.0) for b in (0.0, WIDTH) for a in x]
-    lines, elements, n = list[tuple[int, int, int]](), list[str](), CELLS + 1
-    for i in range(1, n):
-        p, q, r, s = i, i + 1, n + i + 1, n + i
-        corners = ((p, q, r), (p, r, s)) if i % 2 else ((p, q, s), (q, r, s))
-        elements += [f"2 2 1 1 {a} {b} {c}" for a, b, c in corners]
-        lines += [(4, p, q), (4, s, r)]
-    elements += [f"1 2 {k} {k} {a} {b}" for k, a, b in [(2, 1, n + 1), (3, n, 2 * n), *lines]]
-    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "4"]
-    text += ['2 1 "sheet"', '1 2 "left"', '1 3 "right"', '1 4 "sides"', "$EndPhysicalNames"]
-    text += ["$Nodes", str(len(nodes)), *(f"{i} {a} {b} {c}" for i, (a, b, c) in enumerate(nodes, 1)), "$EndNodes"]
-    text += ["$Elements", str(len(elements)), *(f"{i} {e}" for i, e in enumerate(elements, 1)), "$EndElements"]
+def looked_at(at: Array, before: Array) -> tuple[int, float]:
+    """How many triangles (n, 3, 3), not near in the undeformed shell, pass through each other; their least distance."""
+    middle = at.mean(axis=1)
+    size = np.linalg.norm(at - middle[:, None], axis=2).max()
+    i, j = scipy.spatial.cKDTree(middle).query_pairs(2 * size + NEAR, output_type="ndarray").T
+    apart = np.linalg.norm((before[i] - before[j]).mean(axis=1), axis=1) > APART
+    one, other = at[i[apart]], at[j[apart]]
+    return int(passing(one, other).sum()), float(distances(one, other).min(initial=np.inf))
+
+
+def mesh(file: Path, nodes: Array, cells: Sequence[Sequence[int]], held: Callable[[Array], str]) -> Path:
+    """A mesh file of flat triangles; `held` names a part of the edge by the middle of a side."""
+    sides = Counter(tuple(sorted((c[k - 1], c[k]))) for c in cells for k in range(3))
+    edge = {side: held(nodes[[*side]].mean(axis=0)) for side, times in sides.items() if times == 1}
+    names = sorted({*edge.values()})
+    elements = [f"2 2 1 1 {a + 1} {b + 1} {c + 1}" for a, b, c in cells]
+    for (a, b), name in edge.items():
+        elements.append("1 2 {0} {0} {1} {2}".format(names.index(name) + 2, a + 1, b + 1))
+    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names) + 1), '2 1 "all"']
+    text += [*(f'1 {k} "{name}"' for k, name in enumerate(names, 2)), "$EndPhysicalNames", "$Nodes", str(len(nodes))]
+    text += [*(f"{k} {x!r} {y!r} 0" for k, (x, y) in enumerate(nodes.tolist(), 1)), "$EndNodes", "$Elements"]
+    text += [str(len(elements)), *(f"{k} {element}" for k, element in enumerate(elements, 1)), "$EndElements"]
     file.write_text("\n".join(text) + "\n", encoding="utf-8")
     return file
 
 
+def sheet(file: Path) -> Path:
+    """A strip along x with the ends left and right."""
+    n = CELLS + 1
+    nodes = np.array([(x, y) for y in (0.0, WIDTH) for x in np.linspace(0, 1, n)])
+    cells = list[tuple[int, int, int]]()
+    for p in range(CELLS):
+        q, r, s = p + 1, n + p + 1, n + p
+        cells += [(p, q, s), (q, r, s)] if p % 2 else [(p, q, r), (p, r, s)]
+    return mesh(file, nodes, cells, lambda at: {0.0: "left", 1.0: "right"}.get(float(at[0]), "sides"))
+
+
+def disc(file: Path) -> Path:
+    """A disc of rings of cells, whose rim has the parts left and right."""
+    angles = [2 * np.pi * np.arange(6 * k) / (6 * k) for k in range(1, RINGS + 1)]
+    rings = [RADIUS * k / RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for k, a in enumerate(angles, 1)]
+    nodes = np.concatenate([np.zeros((1, 2)), *rings])
+    cells = scipy.spatial.Delaunay(nodes + 1e-6 * np.stack([nodes[:, 1] ** 2, nodes[:, 0] ** 2], axis=1)).simplices
+    x = 0.75 * RADIUS
+    return mesh(file, nodes, cells.tolist(), lambda at: "left" if at[0] < -x else "right" if at[0] > x else "sides")
+
+
+def motion(seed: int) -> dict[str, Any]:
+    """The right end is turned over by about half a turn, and pressed on the rest; a disc is also twisted."""
+    rng, is_sheet = np.random.default_rng(seed), seed < SHEETS
+    tilt, far = (0.15, 0.1) if is_sheet else (0.5, 0.15)
+    axis = np.array([0.0, -1.0, 0.0]) + rng.uniform(-tilt, tilt, 3) * [1, 0, 1]
+    point = [rng.uniform(0.6, 0.75), WIDTH / 2, 0.0] if is_sheet else [rng.uniform(0.1, 0.2) * RADIUS, 0.0, 0.0]
+    turn = {
+        "axis": axis.tolist(),
+        "point": [float(x) for x in point],
+        "angle": float(rng.uniform(180, 300 if is_sheet else 240)),
+    }
+    moved = [0.0, float(rng.uniform(-far, far)), float(h * (rng.uniform(-8, -2) if is_sheet else rng.uniform(-3, 0)))]
+    return {"supports": ["right"], "rotation": turn, "translation": moved}
+
+
 def case(file: Path, seed: int) -> Case:
-    """A sheet whose right end is turned over by about half a turn, and pressed on the sheet and past it."""
-    rng = np.random.default_rng(seed)
-    axis = np.array([0.0, -1.0, 0.0]) + rng.uniform(-0.15, 0.15, 3) * [1, 0, 1]
-    move = {
-        "supports": ["right"],
-        "rotation": {
-            "axis": [float(a) for a in axis], "point": [float(rng.uniform(0.6, 0.75)), WIDTH / 2, 0],
-            "angle": float(rng.uniform(180, 300)),
-        },
-        "translation": [0, float(rng.uniform(-0.1, 0.1)), float(h * rng.uniform(-8, -2))],
-    }  # fmt: skip
+    """A push."""
+    surface = sheet(file) if seed < SHEETS else disc(file)
+    shell = {
+        "geometry": "mesh",
+        "file": str(surface),
+        "radius": 1,
+        "thickness": h,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
+    }
     return Case.model_validate(
         {
-            "shell": {
-                "geometry": "mesh", "file": str(sheet(file)), "radius": 1, "thickness": h, "youngs_modulus": 1,
-                "poisson_ratio": 0.3,
-            },
+            "shell": shell,
             "boundary": {"left": "clamped", "right": "clamped"},
             "contact": [["shell", "shell"]],
             "mesh": {"degree": 3},
-            "loading": {"kind": "edge", "control": "load", "points": 1, "factor": 1, "moves": [move]},
+            "loading": {"kind": "edge", "control": "load", "points": 12, "factor": 1, "moves": [motion(seed)]},
         }
-    )  # fmt: skip
+    )
 
 
 def push(folder: Path, seed: int, seen: Callable[[float], object] = lambda factor: None) -> Push:
     """One push; `seen` gets its progress."""
-    begun, scene = time.process_time(), Scene(case(folder / "sheet.msh", seed))
-    model = scene.model
-    cells = model.V.dofmap.list
-    corners = cells[:, :3]  # vertices come first
-    meet = (corners[:, None, :, None] == corners[None, :, None, :]).any(axis=(2, 3))
-    apart = np.triu(np.repeat(np.repeat(~meet, PARTS**2, axis=0), PARTS**2, axis=1))
-    points, touching, passed, factor, stopped = 0, 0, 0, 0.0, ""
+    begun, scene = time.process_time(), Scene(case(folder / "shell.msh", seed))
+    before = triangles(scene, 0 * scene.model.r0.x.array)
+    points, touching, intersections, least, factor, said = 0, 0, 0, np.inf, 0.0, ""
     try:
         for record in follow(scene):
             state = record.point.state
-            at = triangles(scene, model.system.with_ghosts(state.u, state.mu), cells)
-            passed += crossings(at, at, apart)
+            found, distance = looked_at(triangles(scene, scene.model.system.with_ghosts(state.u, state.mu)), before)
+            intersections, least = intersections + found, min(least, distance)
             touching += scene.observe(state)["contact_force"] > 0
             points, factor = points + 1, state.mu["motion"]
             seen(factor)
     except Stopped as e:
-        stopped = str(e)
-    return Push(seed, points, touching, passed, factor, time.process_time() - begun, stopped)
+        said = str(e)
+    why = "target" if not said else "fold" if said.startswith(FOLD) else "failed"
+    gap = least / h - 1 if np.isfinite(least) else np.nan
+    took, kind = time.process_time() - begun, "sheet" if seed < SHEETS else "disc"
+    return Push(seed, kind, factor, why, points, touching, gap, intersections, took, said)
 
 
-def pushes(seeds: range, table: Path) -> Iterator[Push]:
+def read(table: Path) -> list[Push]:
+    """The pushes that a table has."""
+    if not table.exists():
+        return []
+    with table.open(encoding="utf-8") as file:
+        return [Push(**{each.name: each.type(row[each.name]) for each in fields(Push)}) for row in csv.DictReader(file)]  # type: ignore[operator]
+
+
+def pushes(seeds: Sequence[int], table: Path) -> Iterator[Push]:
     """The pushes of some seeds that a table does not have, which they are added to."""
-    done = set[int]()
-    if table.exists():
-        with table.open(encoding="utf-8") as file:
-            done = {int(row["seed"]) for row in csv.DictReader(file)}
-    for seed in seeds:
-        if seed in done:
-            continue
+    done = {each.push for each in read(table)}
+    for seed in (each for each in seeds if each not in done):
         with TemporaryDirectory() as folder:
             pushed = push(Path(folder), seed, partial(print, f"\r{seed}:", end="", flush=True))
         new = not table.exists()
@@ -169,11 +245,33 @@ def pushes(seeds: range, table: Path) -> Iterator[Push]:
         yield pushed
 
 
+def counts(done: Sequence[Push]) -> Iterator[str]:
+    """A table of Markdown: a row for each kind."""
+    yield "| | pushes | target | fold | failed | points | touching | smallest gap | intersections | CPU s |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    for kind in ("sheet", "disc"):
+        of = [each for each in done if each.kind == kind]
+        why = [sum(each.why == reason for each in of) for reason in ("target", "fold", "failed")]
+        sums = [sum(each.points for each in of), sum(each.touching for each in of)]
+        gap = f"{np.nanmin([each.gap for each in of] or [np.nan]):.3f} h"
+        numbers = [
+            len(of),
+            *why,
+            *sums,
+            gap,
+            sum(each.intersections for each in of),
+            round(sum(each.seconds for each in of)),
+        ]
+        yield f"| {kind} | " + " | ".join(map(str, numbers)) + " |"
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pushes", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--only", type=int, nargs="*", help="these pushes alone")
     parser.add_argument("--table", type=Path, default=Path("pushes.csv"))
     given = parser.parse_args()
-    for pushed in pushes(range(given.first, given.first + given.pushes), given.table):
+    for pushed in pushes(given.only or range(given.first, given.first + given.pushes), given.table):
         print("\r", *asdict(pushed).values(), flush=True)
+    print(*counts(read(given.table)), sep="\n")

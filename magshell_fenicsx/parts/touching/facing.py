@@ -34,6 +34,8 @@ BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it i
 MANY = 2_000_000  # distances of a point from a place at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
+BELOW = 0.5  # the sine of an angle between a surface and the way from a place to a point that is above it
+SHRUNK = 0.9  # of the way between corners of cells beside each other, less than which they are apart where these fold
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 
@@ -86,7 +88,7 @@ class Facing:
         centres = (both[0][0] + both[1][0]) / 2
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
-        near = self._fit(*near_pairs(centres, radii, self._h))
+        near = self._fit(*near_pairs(centres, radii, self._h), self._h, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -105,12 +107,40 @@ class Facing:
         middle = corners[:, 0] + ((low + high) / 2)[:, None] * normal
         return np.asarray(middle), np.asarray(normal), np.asarray(self._cells.overshoot * (high - low) / 2)
 
-    def _fit(self, i: Longs, j: Longs) -> tuple[Longs, Longs]:
-        """The pairs of cells that may touch."""
-        keys = i * len(self._cells.nodes) + j
-        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
-        fits = (self._beside[at] != keys) & self._allowed(i, j)
+    def _fit(self, i: Longs, j: Longs, far: float = 0.0, *displaced: Array) -> tuple[Longs, Longs]:
+        """The pairs of cells that may touch; of those beside each other where one of some surfaces is folded."""
+        allowed = self._allowed(i, j)
+        i, j = i[allowed], j[allowed]
+        fits = ~self._is_beside(i * len(self._cells.nodes) + j)
+        beside = np.flatnonzero(~fits)
+        for r in displaced:
+            fits[beside] |= self._folded(i[beside], j[beside], r, far)
         return i[fits], j[fits]
+
+    def _is_beside(self, keys: Longs) -> Inside:
+        """Whether pairs i * cells + j are of cells that are near in the surface."""
+        at = np.minimum(np.searchsorted(self._beside, keys), len(self._beside) - 1)
+        return np.asarray(self._beside[at] == keys)
+
+    def _folded(self, i: Longs, j: Longs, r: Array, far: float) -> Inside:
+        """Whether places of cells (n,) may be nearer than `far` to those of others that are not near in the surface."""
+        found, nodes = np.zeros(len(i), dtype=bool), self._cells.nodes
+        (_, radii), (_, wide) = self._spheres(r), self._spheres(self._r0)
+        for some in np.array_split(np.arange(len(i)), 1 + len(i) * nodes.shape[1] ** 2 // MANY):
+            a, b = nodes[i[some]], nodes[j[some]]
+            for count in (3, nodes.shape[1]):  # corners come first
+                one, other = a[:, :count, None], b[:, None, :count]
+                way, now = (np.linalg.norm(x[one] - x[other], axis=3) for x in (self._r0, r))
+                if count == 3:
+                    some = some[shrunk := (now < SHRUNK * way).any(axis=(1, 2))]
+                    a, b = a[shrunk], b[shrunk]
+                    continue
+                between = BETWEEN / self._cells.element.degree
+                apart = between * (radii[i[some]] + radii[j[some]])
+                before = between * (wide[i[some]] + wide[j[some]])
+                near = (now < far + apart[:, None, None]) & (way > BESIDE * self._h - before[:, None, None])
+                found[some] = near.any(axis=(1, 2))
+        return found
 
     def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
         """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
@@ -121,7 +151,7 @@ class Facing:
                 return pairs
         centres, radii = self._spheres(self._r0 + u)
         margin = reach + MARGIN * float(radii.mean())
-        i, j = self._fit(*near_pairs(centres, radii, margin))
+        i, j = self._fit(*near_pairs(centres, radii, margin), margin, self._r0 + u)
         mine = np.zeros(len(centres), dtype=bool)
         mine[self._rule.cell] = True
         pairs = i[mine[i]], j[mine[i]]
@@ -172,7 +202,23 @@ class Facing:
             if not len(point):
                 return nowhere()
         at = Places(point, cell, *project(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return at.of(at.distance < of_faces)
+        return self._away(points, at.of(at.distance < of_faces), r[:, :3])
+
+    def of_far_cells(self, points: Points, at: Places) -> Places:
+        """Those in cells that are not near in the surface: others are not cut along each other."""
+        return at.of(~self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell))
+
+    def _away(self, points: Points, at: Places, r: Array) -> Places:
+        """Those that are not near their points within the surface: in cells beside each other, across a fold."""
+        beside = self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell)
+        if not beside.any():
+            return at
+        asked = at.of(beside)
+        (_, y), *_ = jets(self._cells.element, asked.X, self._r0[self._cells.nodes[asked.cell]], 0)
+        way = np.linalg.norm(self.x_of(points, self._r0, asked.point) - y, axis=1)
+        stays = ~beside
+        stays[beside] = (way > BESIDE * self._h) & self._above(points, asked, r)
+        return at.of(stays)
 
     def _facing(self, points: Points, at: Places, r: Array) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
@@ -182,6 +228,7 @@ class Facing:
         order = np.argsort(keys, kind="stable")
         at, keys = at.of(order), keys[order]
         on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
+        above, beside = self._above(points, at, r), points.cell[at.point] * number
         stays = np.ones(len(keys), dtype=bool)
         for side in range(3):
             beyond = cells.across[at.cell, side]
@@ -189,7 +236,8 @@ class Facing:
             there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
             listed = keys[there] == at.point * number + beyond
             nearer = at.distance[there] < at.distance - SAME * self._h
-            stays &= ~asked | (listed & ~nearer)
+            folded = above & self._is_beside(beside + beyond)  # what goes on there is not looked at
+            stays &= ~asked | (listed & ~nearer) | folded
         at = at.of(stays)
         if not len(at.point):
             return at
@@ -210,6 +258,13 @@ class Facing:
         first = at.firsts
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
+
+    def _above(self, points: Points, at: Places, r: Array) -> Inside:
+        """Whether places (n,) are below their points, and not beside them as in one surface that is flat."""
+        (_, y), (_, a1), (_, a2) = jets(self._cells.element, at.X, r[self._cells.nodes[at.cell]], 1)
+        off, normal = self.x_of(points, r, at.point) - y, np.cross(a1, a2)
+        level = np.linalg.norm(off, axis=1) * np.linalg.norm(normal, axis=1)
+        return np.asarray(np.abs(np.sum(off * normal, axis=1)) > BELOW * level)
 
     def left_to_edges(self, points: Points, at: Places, normals: Array) -> Inside:
         """Which places (n,) do not count: those of points inside a surface that face an edge of another one, steeply.

@@ -350,7 +350,7 @@ class Touching:
         """The places in all cells that may press on cells of this rank at a displacement."""
         far = self._h + self._segments.within
         near = self._facing.places_in(self._rule, u, self._facing.placed(u), float(far.max()))
-        return near.of(near.distance < far[self._rule.cell[near.point]])
+        return self._facing.of_far_cells(self._rule, near.of(near.distance < far[self._rule.cell[near.point]]))
 
     # geometry
 
