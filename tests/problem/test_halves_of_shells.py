@@ -140,7 +140,7 @@ def test_pressed_halves_are_the_whole(name: str) -> None:
     """The half's equilibrium and its image are one of all shells on the mirrored mesh, with its forces: 1e-7."""
     across, size, data = PRESSED[name]
     data = data | {"mesh": {"degree": 3, "size": size}}
-    half, whole = (Scene(Case.from_source(data | {"symmetry": symmetry})) for symmetry in ("auto", "none"))
+    half, whole = (Scene(Case.from_source(data | {"symmetry": symmetry})) for symmetry in ("half", "none"))
     plane = half.problem.mirror
     assert plane is not None
     assert abs(plane.normal @ ACROSS[across]) == pytest.approx(1)

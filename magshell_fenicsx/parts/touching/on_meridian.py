@@ -96,17 +96,10 @@ class MeridianTouching:
         Of the quadrature.
     """
 
-    amplitude = None
-    column = ""
+    amplitude, column = None, ""
 
     def __init__(
-        self,
-        pair: Pair,
-        r0: fem.Function,
-        u: fem.Function,
-        sides: tuple[Inside, Inside],
-        h: float,
-        degree: int,
+        self, pair: Pair, r0: fem.Function, u: fem.Function, sides: tuple[Inside, Inside], h: float, degree: int
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
@@ -261,8 +254,7 @@ class MeridianTouching:
             area = 2 * np.pi * x[..., 0] * speed * w
             normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
             on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
-            cell = np.repeat(cells, len(X))
-            shape = np.tile(table[0], (len(cells), 1))
+            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
             parts.append((cell, shape, area.ravel(), self._sides[0][cell], normal.reshape(-1, 2), on_edge))
         return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
@@ -408,12 +400,7 @@ class MeridianTouching:
 
 
 def touchings(
-    pairs: Sequence[Pair],
-    r0: fem.Function,
-    u: fem.Function,
-    patches: Mapping[str, Inside],
-    h: float,
-    degree: int,
+    pairs: Sequence[Pair], r0: fem.Function, u: fem.Function, patches: Mapping[str, Inside], h: float, degree: int
 ) -> list[MeridianTouching]:
     """The contacts of pairs of shells.
 
@@ -460,5 +447,4 @@ def _entries(H: Array, nodes: Longs, size: int) -> Entries:
 
 
 def _nowhere() -> Faced:
-    nothing = np.zeros(0, dtype=np.int64)
-    return Faced(nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
+    return Faced(*np.zeros((2, 0), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
