@@ -447,4 +447,4 @@ def _entries(H: Array, nodes: Longs, size: int) -> Entries:
 
 
 def _nowhere() -> Faced:
-    return Faced(*np.zeros((2, 0), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
+    return Faced(*(np.zeros(0, dtype=of) for of in (np.int64, np.int64, np.float64, np.bool_, np.float64)))
