@@ -157,8 +157,7 @@ class MeridianTouching:
 
     def around(self) -> tuple[Longs, Longs]:
         """See `Coupled`: the nodes of cells that touch."""
-        nodes = self._nodes[self._touching_cells()]
-        return pairs_of(nodes.reshape(len(nodes), 2 * self._nodes.shape[1]))
+        return pairs_of(np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1))
 
     def _touching_cells(self) -> Longs:
         at = self._pressed()
@@ -447,4 +446,5 @@ def _entries(H: Array, nodes: Longs, size: int) -> Entries:
 
 
 def _nowhere() -> Faced:
-    return Faced(*(np.zeros(0, dtype=of) for of in (np.int64, np.int64, np.float64, np.bool_, np.float64)))
+    nothing = np.zeros(0, dtype=np.int64)
+    return Faced(nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
