@@ -39,3 +39,13 @@ def test_stacked_domes() -> None:
     assert last["load_factor"] == pytest.approx(both, rel=2e-2)
     assert last["load_factor"] == pytest.approx(1.934e-5, rel=2e-3)
     assert last["contact_force"] > 0
+
+
+@pytest.mark.slow
+def test_coaxial_domes() -> None:
+    """All around, on the meridians: both folds have the force of 36 sectors of 10 degrees, with their error, 1.5e-3."""
+    result = run(Case.load(CASES / "coaxial_domes.yaml"))
+    assert result.scene.model.axisymmetric
+    first, _, last = (row for row in result.rows if row["label"] == "fold")
+    assert first["load_factor"] / 36 == pytest.approx(2.286e-6, rel=1.5e-3)
+    assert last["load_factor"] / 36 == pytest.approx(1.934e-5, rel=1.5e-3)
