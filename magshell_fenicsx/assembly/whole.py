@@ -157,9 +157,10 @@ class WholeMatrix:
         return Beside(K, Rows(self, kept), Rows(self, whole))
 
     def _in(self, starts: NDArray[np.intp], columns: NDArray[np.intp], part: OfTerm) -> csr_array:
-        """What a sparse matrix has entries for, of a term without its factor; found once, as patterns do not change."""
+        """What a sparse matrix has entries for, of a term without its factor; found once for each pattern."""
         found = self._found
-        if found is None or found[0] is not part.stored or len(found[1].data) != len(columns):
+        same = found is not None and found[0] is part.stored and np.array_equal(found[1].indices, columns)
+        if found is None or not same or not np.array_equal(found[1].indptr, starts):
             rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
             free = ~(self.held[0][rows] | self.held[1][columns])
             given = np.where(free, _entries(part.stored, rows, columns), 0.0)

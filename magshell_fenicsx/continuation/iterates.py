@@ -52,6 +52,8 @@ class Iterates:
         Whether steps may shrink suddenly less: then none is foreseen.
     hasty
         Whether the solve is given up early where a shorter step of the path costs less.
+    allowed
+        The foreseen error up to which the last iterate was accepted.
     """
 
     largest: float = np.inf
@@ -60,6 +62,7 @@ class Iterates:
     kinks: bool = False
     hasty: bool = False
     steps: list[Step] = field(default_factory=list)
+    allowed: float = 0.0
 
     @property
     def foreseen(self) -> float:
@@ -71,8 +74,8 @@ class Iterates:
 
     @property
     def error(self) -> float:
-        """The estimated error after the last step."""
-        return min(self.steps[-1].size, self.foreseen) if self.steps else np.inf
+        """The estimated error after the last step; where that was foreseen, no less than what was allowed."""
+        return min(self.steps[-1].size, max(self.foreseen, self.allowed)) if self.steps else np.inf
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
         """The verdict on the iterate, from the last step.
@@ -87,7 +90,8 @@ class Iterates:
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
             return "far" if self.hasty else "diverged"
-        if min(step.size, self.foreseen / SURE[len(self.steps) == 2]) <= tolerance:
+        self.allowed = SURE[len(self.steps) == 2] * tolerance
+        if step.size <= tolerance or self.foreseen <= self.allowed:
             return "converged"
         own = [s for s in before if s.own]
         full = [s.size for s in own]

@@ -110,9 +110,9 @@ class Tangents:
         return self._factorisation
 
     def near(self, state: State, most: float) -> bool:
-        """Whether the latest factors belong to a state not farther from another one than so many lengths."""
+        """Whether the latest factors belong to a state less than so many lengths from another one; of any load."""
         mine, system = self.state, self.system
-        return mine is not None and max_abs(system.comm, state.u - mine.u) <= most * system.length
+        return mine is not None and max_abs(system.comm, state.u - mine.u) < most * system.length
 
     def at(
         self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False, sure: bool = True

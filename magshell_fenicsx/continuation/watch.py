@@ -307,7 +307,7 @@ class Watch:
 
     def _closer(self, other: _Look | None, low: _Look, high: _Look, halvings: int) -> Iterator[_Look]:
         """Looks between two, from a third one before or after these; without one the middle is looked at."""
-        if not halvings or not self._may_recover(other, low, high):
+        if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
             return
         step = Step(self._path, low.point, high.point)
         about = self._look_between(low, high, step.about_middle())
