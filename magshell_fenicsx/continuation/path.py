@@ -361,7 +361,10 @@ class Path:
         self.progress.trying(here, s - here.s)
         guess = self._extended(s, passed)
         moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
-        point = self.at(s, guess, here, most=max(WILD * moved, LEAST_MOST))
+        most = (
+            np.inf if self.newton.options.kinks else max(WILD * moved, LEAST_MOST)
+        )  # steps may grow where forces set in
+        point = self.at(s, guess, here, most=most)
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
