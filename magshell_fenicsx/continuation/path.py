@@ -361,10 +361,8 @@ class Path:
         self.progress.trying(here, s - here.s)
         guess = self._extended(s, passed)
         moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
-        most = (
-            np.inf if self.newton.options.kinks else max(WILD * moved, LEAST_MOST)
-        )  # steps may grow where forces set in
-        point = self.at(s, guess, here, most=most)
+        grows = self.newton.options.kinks  # steps may, where forces set in
+        point = self.at(s, guess, here, most=np.inf if grows else max(WILD * moved, LEAST_MOST))
         if isinstance(point, str):
             return point
         if turned := point.turned_from(here):
