@@ -259,7 +259,7 @@ class Path:
                 length = min(length, self._past_fold(passed, length))
                 cubic, quintic = self._missed(passed)
                 smooth = quintic < cubic
-                if smooth:
+                if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 tried = self._try(s, passed[-3:] if smooth else passed[-2:])
@@ -276,7 +276,7 @@ class Path:
                 straight = self._cosine(here, tried) > self.options.straight
                 o = self.options
                 if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
-                    step = min(max(step, 1.5 * length), o.largest)
+                    step = min(max(step, min(step + length / 2, 2 * length)), o.largest)  # a target may have cut it
                 elif tried.factorisations >= o.hard:
                     step = 0.6 * length
                 before = [] if self._corner(here, tried) else passed[1 - LOOKED_BACK :]
@@ -310,9 +310,8 @@ class Path:
     def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
         *earlier, here = passed
-        if len(earlier) < 3:
-            return np.inf, np.inf
-        return self._distance(earlier[-2:], here), self._distance(earlier[-3:], here)
+        cubic, quintic = (self._distance(earlier[-n:], here) if len(earlier) >= n else np.inf for n in (2, 3))
+        return cubic, quintic
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
         """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""

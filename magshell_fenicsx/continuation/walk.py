@@ -77,7 +77,8 @@ class _Search:
         self.path.progress.doing("locating an instability")
         single = change == 1 or not halvings
         if single and turned:
-            yield Instability(self.finished(self.fold(low, high)), "fold")
+            fold = self.fold(low, high)
+            yield Instability(self.counted(fold, low, high) if change == 1 else self.finished(fold), "fold")
         elif single:
             point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):
@@ -180,6 +181,12 @@ class _Search:
         done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
         self.iterations = self.factorisations = 0
         return done
+
+    def counted(self, fold: Point, low: Point, high: Point) -> Point:
+        """A fold, with its work and the counts of the end with fewer unstable directions: a neutral one is none of them."""
+        end = min(low, high, key=lambda point: point.negative_pivots)
+        counts = {"negative_pivots": end.negative_pivots, "negative_pivots_held": end.negative_pivots_held}
+        return replace(self.spent(fold), **counts)
 
     def finished(self, point: Point) -> Point:
         """The point with its own tangent and inertia, and with the work."""
