@@ -15,7 +15,7 @@ import numpy as np
 from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way
 from magshell_fenicsx.continuation.excluded import ExcludedLines, Excluding, nearest_eigenvalue
 from magshell_fenicsx.continuation.fold import AugmentedTangent
-from magshell_fenicsx.continuation.interpolated import interpolated, slope, stationary
+from magshell_fenicsx.continuation.interpolated import hermite, interpolated, slope, stationary
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
@@ -180,8 +180,7 @@ class Boundary:
     def _hermite(self, low: Locus, high: Locus, step: float, t: float) -> Way:
         """The cubic at t in units of the step, which is measured along the tangent at the low end."""
         faster = 1 / self.inner(low.way, high.way)
-        h00, h10 = (1 + 2 * t) * (1 - t) ** 2, t * (1 - t) ** 2
-        h01, h11 = t**2 * (3 - 2 * t), t**2 * (t - 1)
+        (h00, h10), (h01, h11) = hermite(t, (0.0, 1.0))
         a, b, name = step * h10, step * faster * h11, self.name
 
         def at(x0: float, d0: float, x1: float, d1: float) -> float:

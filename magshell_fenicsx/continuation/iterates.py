@@ -17,6 +17,15 @@ ROUNDING = 10.0  # steps up to this many times the rounding error count as round
 Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
+def foreseen(sizes: Sequence[float]) -> float:
+    """The error after the last of some steps, if all further ones shrink as much as that; infinite if it shrank little.
+
+    See P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4.
+    """
+    rate = sizes[-1] / sizes[-2] if len(sizes) > 1 else np.inf
+    return sizes[-1] * rate / (1 - rate) if rate <= STEADY else np.inf
+
+
 @dataclass(frozen=True)
 class Step:
     """The next step at an iterate.
@@ -66,11 +75,8 @@ class Iterates:
 
     @property
     def foreseen(self) -> float:
-        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
-        if self.kinks or self.searched or len(self.steps) < 2:
-            return np.inf
-        rate = self.steps[-1].size / self.steps[-2].size
-        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
+        """The error after the last step, where it can be foreseen."""
+        return np.inf if self.kinks or self.searched else foreseen([step.size for step in self.steps])
 
     @property
     def error(self) -> float:

@@ -309,8 +309,7 @@ class Path:
 
     def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
-        *earlier, here = passed
-        cubic, quintic = (self._distance(earlier[-n:], here) if len(earlier) >= n else np.inf for n in (2, 3))
+        cubic, quintic = (self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf for n in (3, 4))
         return cubic, quintic
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
+from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict, foreseen
 from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat
 
@@ -24,7 +24,7 @@ MOTION = 0.1  # this part of the largest displacement counts as the length where
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
-CERTAIN = 0.1  # ratio of two such steps, and part of the tolerance, for which the error is not looked at again
+CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 FAR = "the first guess is too far away"
@@ -264,14 +264,11 @@ class Linearised:
         return state
 
     def _foreseeable(self, state: State) -> float:
-        """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not.
-
-        The error after a step with computed forces is that step times their ratio (Deuflhard, sec. 2.1.4).
-        """
-        least, steps = self._least(state), self._computed
-        if len(steps) > 1 and steps[-1] <= CERTAIN * steps[-2] and steps[-1] ** 2 <= CERTAIN * least * steps[-2]:
+        """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not."""
+        least = self._least(state)
+        if foreseen(self._computed) <= CERTAIN * least:
             return -1.0
-        return max(least, float(FORESEEN ** (1 + len(steps) / 2)) * self._ventured)
+        return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
 
     def _again(self, f: Direction) -> Direction:
         """The next step by the same matrix, in place of one with foreseen forces."""

@@ -183,7 +183,7 @@ class _Search:
         return done
 
     def counted(self, fold: Point, low: Point, high: Point) -> Point:
-        """A fold, with its work and the counts of the end with fewer unstable directions: a neutral one is none of them."""
+        """A fold with its work and the counts of the end with fewer unstable directions: none of them is neutral."""
         end = min(low, high, key=lambda point: point.negative_pivots)
         counts = {"negative_pivots": end.negative_pivots, "negative_pivots_held": end.negative_pivots_held}
         return replace(self.spent(fold), **counts)

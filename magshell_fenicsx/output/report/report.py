@@ -2,7 +2,6 @@
 
 import base64
 import io
-import webbrowser
 from collections.abc import Iterator, Sequence
 from math import isnan
 from pathlib import Path
@@ -268,6 +267,8 @@ def report_of(folder: Path) -> Path:
 
 def opened(file: Path) -> bool:
     """Whether a web browser could be asked to show a file."""
+    import webbrowser
+
     try:
         return webbrowser.open(file.as_uri())
     except webbrowser.Error:

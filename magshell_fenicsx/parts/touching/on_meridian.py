@@ -17,7 +17,6 @@ from zlib import crc32
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
-from scipy.special import roots_jacobi
 
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
@@ -429,6 +428,8 @@ def _beside(nodes: Longs) -> Longs:
 
 def _rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     """Points and weights on [0, 1]: Gauss's, or Radau's and Lobatto's with points next to ends."""
+    from scipy.special import roots_jacobi  # takes long to import
+
     inner: Callable[..., tuple[Array, Array]] = roots_jacobi
     x, w = inner(count - begins - ends, float(ends), float(begins))
     w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
