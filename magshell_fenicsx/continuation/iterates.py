@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -10,19 +11,19 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
-STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
-SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
+STEADY = 0.1  # steps that twice shrink more than to this part foresee the next ones; once may be by chance
+SURE = 0.1  # part of the tolerance, for an error that is foreseen
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 
 Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
-def foreseen(sizes: Sequence[float]) -> float:
-    """The error after the last of some steps, if all further ones shrink as much as that; infinite if it shrank little.
+def foreseen(sizes: Sequence[float], ratios: int) -> float:
+    """The error after the last of some steps, if all further ones shrink as so many did; infinite if one shrank little.
 
     See P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4.
     """
-    rate = sizes[-1] / sizes[-2] if len(sizes) > 1 else np.inf
+    rate = max(b / a for a, b in pairwise(sizes[-1 - ratios :])) if len(sizes) > ratios else np.inf
     return sizes[-1] * rate / (1 - rate) if rate <= STEADY else np.inf
 
 
@@ -75,8 +76,11 @@ class Iterates:
 
     @property
     def foreseen(self) -> float:
-        """The error after the last step, where it can be foreseen."""
-        return np.inf if self.kinks or self.searched else foreseen([step.size for step in self.steps])
+        """The error after the last step, where the last two ratios foresee it.
+
+        Bending may converge at once and hide stretching, which converges slowly: so one small ratio foresees nothing.
+        """
+        return np.inf if self.kinks or self.searched else foreseen([step.size for step in self.steps], 2)
 
     @property
     def error(self) -> float:
@@ -96,7 +100,7 @@ class Iterates:
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
             return "far" if self.hasty else "diverged"
-        self.allowed = SURE[len(self.steps) == 2] * tolerance
+        self.allowed = SURE * tolerance * min(1.0, max(step.size for step in self.steps))
         if step.size <= tolerance or self.foreseen <= self.allowed:
             return "converged"
         own = [s for s in before if s.own]

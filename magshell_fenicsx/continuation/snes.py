@@ -266,7 +266,7 @@ class Linearised:
     def _foreseeable(self, state: State) -> float:
         """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not."""
         least = self._least(state)
-        if foreseen(self._computed) <= CERTAIN * least:
+        if foreseen(self._computed, 1) <= CERTAIN * least:  # one ratio: each costs much
             return -1.0
         return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
 
