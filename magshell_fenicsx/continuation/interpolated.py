@@ -6,6 +6,8 @@ from math import prod
 import numpy as np
 import scipy
 
+REAL = 1e-12  # imaginary part of a root that counts as real
+
 
 def slope(places: Sequence[float]) -> list[tuple[float, float]]:
     """Weights and places of the slope at the first place of the polynomial through all."""
@@ -20,12 +22,22 @@ def interpolated(x: Sequence[float], y: Sequence[float], at: float) -> float:
     return float(scipy.interpolate.barycentric_interpolate(x, y, at))
 
 
-def stationary(rise: float, d0: float, d1: float) -> float:
-    """The place between 0 and 1, not too close to these, where a cubic is stationary, from its rise and end slopes."""
+def _flat(rise: float, d0: float, d1: float) -> list[float]:
+    """The places where a cubic is stationary, from its rise between 0 and 1 and the slopes there."""
     roots = np.roots([3 * (d0 + d1 - 2 * rise), 2 * (3 * rise - 2 * d0 - d1), d0])
-    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
+    return [float(r.real) for r in roots if abs(r.imag) < REAL]
+
+
+def stationary(rise: float, d0: float, d1: float) -> float:
+    """The place between 0 and 1, not too close to these, where that cubic is stationary."""
+    inside = [t for t in _flat(rise, d0, d1) if 0 < t < 1]
     t = inside[0] if inside else d0 / (d0 - d1)
     return float(min(max(t, 1e-3), 1 - 1e-3))
+
+
+def flat_beyond(rise: float, d0: float, d1: float) -> float:
+    """The first place beyond 1 where that cubic is stationary; infinite if there is none."""
+    return min((t for t in _flat(rise, d0, d1) if t > 1), default=np.inf)
 
 
 def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
-from magshell_fenicsx.continuation.interpolated import hermite
+from magshell_fenicsx.continuation.interpolated import flat_beyond, hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
 from magshell_fenicsx.continuation.snes import FAR, HIDDEN
@@ -149,8 +149,8 @@ class Path:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        near = None if counted else high.state
-        return self.solve(self._row(s, base), s, self.between(s, low, high), stress, near=near)
+        guess, near = self.between(s, low, high), None if counted else high.state
+        return self.solve(self._row(s, base), s, guess, stress, near=near)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
         """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
@@ -255,7 +255,7 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        passed, step, leaps, far = [start], self.options.first, 0, None
+        o, passed, step, leaps, far = self.options, [start], self.options.first, 0, None
         for target in targets:
             while (here := passed[-1]).s != target:
                 way = target - here.s
@@ -274,12 +274,10 @@ class Path:
                     leaps += 1
                     over = tried == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
                     step = 2 * length if over else length / 2
-                    if not step >= self.options.smallest:
+                    if not step >= o.smallest:
                         raise PathStopped(tried, here)
                     continue
-                leaps = 0
-                straight = self._cosine(here, tried) > self.options.straight
-                o = self.options
+                leaps, straight = 0, self._cosine(here, tried) > o.straight
                 if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
                     step = min(max(step, min(step + length / 2, 2 * length)), o.largest)  # a target may have cut it
                 elif tried.factorisations >= o.hard:
@@ -305,17 +303,12 @@ class Path:
             return np.inf
         before, here = passed[-2:]
         way, last = here.s - before.s, self.seen_from(before, here)
-        mean = (here.state.mu[self.name] - before.state.mu[self.name]) / way
-        # dmu/ds = first + b t + c t^2 has both slopes and their mean
-        first, c = before.dmu, 3 * (before.dmu + last.dmu - 2 * mean)
-        b = last.dmu - first - c
-        turns = [float(t.real) for t in np.roots([c, b, first]) if abs(t.imag) < SEEN and t.real > 1]
-        return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
+        rise = (here.state.mu[self.name] - before.state.mu[self.name]) / way
+        return max(BEHIND * (flat_beyond(rise, before.dmu, last.dmu) - 1) * abs(way), LEAST_PART * length)
 
-    def _missed(self, passed: Sequence[Point]) -> tuple[float, float]:
+    def _missed(self, passed: Sequence[Point]) -> list[float]:
         """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
-        cubic, quintic = (self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf for n in (3, 4))
-        return cubic, quintic
+        return [self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf for n in (3, 4)]
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
         """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""
@@ -431,8 +424,7 @@ class Path:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
         again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
-        spent = point.factorisations + 1
-        return replace(again, iterations=point.iterations, factorisations=spent, error=point.error)
+        return replace(again, iterations=point.iterations, factorisations=point.factorisations + 1, error=point.error)
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "arc":
