@@ -66,6 +66,7 @@ def test_fold_is_located(step: float) -> None:
     assert found.kind == "fold"
     assert found.point.state.mu["load"] == pytest.approx(2 / (3 * np.sqrt(3)), rel=1e-8)
     assert found.point.s == pytest.approx(1 - 1 / np.sqrt(3), abs=5e-5)
+    assert (found.point.negative_pivots, found.point.negative_pivots_held) == (0, 0)  # a neutral mode is not unstable
 
 
 @pytest.mark.parametrize("control", ["load", "conjugate"])
@@ -117,6 +118,14 @@ def test_targets_are_met_exactly() -> None:
     path, start = path_of(snap_through(), "conjugate", StepOptions(0.07, 0.3, 1e-6))
     reached = [point.s for point, flag in path.towards(start, [0.25, 0.5, 1.75]) if flag]
     assert reached == [0.25, 0.5, 1.75]
+
+
+def test_steps_that_targets_cut_grow() -> None:
+    """A step that is a little shorter than the way between two targets does not stay a half of it."""
+    path, start = path_of(snap_through(), "conjugate", StepOptions(0.015, 0.1, 1e-6))
+    targets = [0.02 * i for i in range(1, 11)]
+    flags = [flag for _, flag in path.towards(start, targets)]
+    assert flags == [False, *(True for _ in targets)]
 
 
 def test_targets_may_turn_back() -> None:
