@@ -183,10 +183,10 @@ class _Search:
         return done
 
     def counted(self, fold: Point, low: Point, high: Point) -> Point:
-        """A fold with its work and the counts of the end with fewer unstable directions: none of them is neutral."""
-        end = min(low, high, key=lambda point: point.negative_pivots)
-        counts = {"negative_pivots": end.negative_pivots, "negative_pivots_held": end.negative_pivots_held}
-        return replace(self.spent(fold), **counts)
+        """A fold with its work and its counts, in which the neutral direction is not unstable."""
+        pivots = min(low.negative_pivots, high.negative_pivots)
+        held = pivots + int(self.path.name in self.path.system.coordinates)  # on that side dq/dmu rises without bound
+        return replace(self.spent(fold), negative_pivots=pivots, negative_pivots_held=held)
 
     def finished(self, point: Point) -> Point:
         """The point with its own tangent and inertia, and with the work."""
