@@ -316,7 +316,7 @@ class Path:
         error = max_abs(self.system.comm, quintic - cubic)
         allowed = max(GUESSED * self.system.length, WORSE * missed)
         part = min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
-        return max(np.floor(PARTS * part), 1.0) / PARTS
+        return float(max(np.floor(PARTS * part), 1.0) / PARTS)
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:
         """How far a point is from where earlier ones led."""
