@@ -78,7 +78,9 @@ class _Search:
         single = change == 1 or not halvings
         if single and turned:
             fold = self.fold(low, high)
-            yield Instability(self.counted(fold, low, high) if change == 1 else self.finished(fold), "fold")
+            point = self.spent(fold) if change == 1 else self.finished(fold)
+            before = low.negative_pivots, low.negative_pivots_held  # rounding decides what its own matrix counts
+            yield Instability(replace(point, negative_pivots=before[0], negative_pivots_held=before[1]), "fold")
         elif single:
             point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):
@@ -181,12 +183,6 @@ class _Search:
         done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
         self.iterations = self.factorisations = 0
         return done
-
-    def counted(self, fold: Point, low: Point, high: Point) -> Point:
-        """A fold with its work and its counts, in which the neutral direction is not unstable."""
-        pivots = min(low.negative_pivots, high.negative_pivots)
-        held = pivots + int(self.path.name in self.path.system.coordinates)  # on that side dq/dmu rises without bound
-        return replace(self.spent(fold), negative_pivots=pivots, negative_pivots_held=held)
 
     def finished(self, point: Point) -> Point:
         """The point with its own tangent and inertia, and with the work."""
