@@ -53,8 +53,7 @@ class ImperfectionStep(LoadStep):
         names = context.loads(ImperfectionStep)
         context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
         if not keys:
-            none = "the case has none; give shell.imperfections (those of several shells do not grow)"
-            raise ValueError(f"{step.key}.kind: imperfection: {none}")
+            raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
         if not grown_by([step], keys)[step.name]:
             raise ValueError(f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from 0")
         if names[step.name].item is None and len(names) > 1:
