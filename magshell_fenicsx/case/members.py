@@ -65,6 +65,18 @@ class Members:
                     mirrors.append(replace(side, lost=lost))
         return mirrors
 
+    def normal(self, x: Array) -> Array:
+        """The outward unit normal (3,) at a place (3,) of the perfect shell that is nearest to it."""
+        found = list[tuple[float, Array]]()
+        for part in self._several.parts:
+            place, perfect = self._several.place(part), ground_of(part.case.shell).perfect
+            own, nodes = place.own(x), perfect.nodes
+            chart = perfect.inverse(own)
+            feet = perfect.embedding(chart[None]) if nodes is None else nodes[:, :3]
+            away = place.scale * float(np.linalg.norm(feet - own, axis=1).min())
+            found.append((away, place.Q @ perfect.normal_near(chart)))
+        return min(found, key=lambda each: each[0])[1]
+
     def _member(self, part: "Part", plane: Mirror | None) -> Member:
         """A shell, or its half at a plane in the frame of the shell. The frame of its mesh is turned about e3."""
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import

@@ -132,7 +132,7 @@ class Several:
         laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
         members = Members(self)
         of_shells = self.joints, self._thicknesses, moduli, laws
-        of_members = members.mirrors, partial(meridians, self), members.half
+        of_members = members.mirrors, partial(meridians, self), members.normal, members.half
         return Assembly(self.digest, members.whole, *of_shells, *of_members)
 
     def of(self, name: str) -> str:

@@ -356,7 +356,7 @@ class Path:
         self.progress.trying(here, s - here.s)
         guess = self._extended(s, passed)
         moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
-        grows = self.newton.options.kinks  # steps may, where forces set in
+        grows = self.newton.options.kinks  # steps may, where forces set in; given up there, they end beside the path
         point = self.at(s, guess, here, most=np.inf if grows else max(WILD * moved, LEAST_MOST))
         if isinstance(point, str):
             return point

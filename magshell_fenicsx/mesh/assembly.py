@@ -112,6 +112,8 @@ class Assembly:
         Planes in which each shell is its own image, see `Outline.mirrors`.
     span
         The meridians of shells with one axis, see `shape.turning.Span`; or why there are none, in words.
+    normal
+        Place (3,) -> the outward unit normal (3,) of the nearest perfect shell there.
     half
         Its half at such a plane, on whose positive side it is, or its sector.
     halved
@@ -128,6 +130,7 @@ class Assembly:
     laws: Mapping[str, str] = field(default_factory=dict)
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)
     span: Callable[[], Any] = field(default=lambda: "there are several shells", repr=False)
+    normal: Callable[[Array], Array] | None = field(default=None, repr=False)
     half: Callable[[Mirror], "Assembly"] | None = field(default=None, repr=False)
     halved: bool = False
     home: None = None

@@ -114,6 +114,9 @@ class Outline:
         shape = self.chart(None, ANY)
         if not isinstance(shape, MeshFile):
             return np.asarray(self.normal(chart[None])[0])
+        if isinstance(shape.given, Assembly):
+            assert shape.given.normal
+            return shape.given.normal(chart)
         nodes = read_msh(replace(shape, normals=True), {}).nodes
         return np.asarray(normals(nodes[[np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()]])[0])
 

@@ -32,6 +32,7 @@ from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
+from magshell_fenicsx.parts.supports.motion import UNHELD
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
@@ -74,7 +75,9 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
     named = {name: next(of for of, at in problem.points.items() if at is x) for name, x in problem.points.items()}
     points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
     pieces = [(piece.name, piece.ends) for piece in span.pieces]
-    meridian = make_meridian(span.embedding, meridian_vertices(problem), span.names, points, span.curvature, pieces)
+    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
+    vertices = meridian_vertices(problem)
+    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held)
     return MeridianModel(
         meridian,
         problem.material,

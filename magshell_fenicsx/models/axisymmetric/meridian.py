@@ -1,6 +1,6 @@
 """The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, sqrt
@@ -131,6 +131,7 @@ def make_meridian(
     points: Mapping[str, tuple[float, float]] | None = None,
     curvature: float = 1.0,
     pieces: Sequence[tuple[str, tuple[float, float]]] = (),
+    held: Collection[str] = (),
 ) -> Meridian:
     """Mesh the meridian.
 
@@ -141,9 +142,12 @@ def make_meridian(
     names
         Of its ends, None for the axis.
     points
-        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place.
+        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place, and where that is
+        held the highest on the axis.
     pieces
         Name and ends of each of several shells, which no cells join.
+    held
+        Ends that supports hold.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
     parts = [ends for _, ends in pieces] or [(float(vertices[0]), float(vertices[-1]))]
@@ -166,8 +170,15 @@ def make_meridian(
     axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
     if points is None or (pieces and "pole" not in points):
-        highest = float(vertices[np.argmax(embedding(np.column_stack([vertices, 0 * vertices]))[:, 2])])
-        points = {**(points or {}), "pole": (highest if pieces else 0.0, 0.0)}
+        places = embedding(np.column_stack([vertices, 0 * vertices]))
+        still = [end for name, end in zip(names, np.ravel(parts), strict=True) if name in held]
+        free = np.abs(np.subtract.outer(vertices, still)).min(axis=1, initial=inf) > ROUNDING
+        highest = np.argmax(places[:, 2])
+        if not free[highest] and free.any():
+            on_axis = free & (np.abs(places[:, 0]) < ROUNDING)
+            highest = np.argmax(np.where(on_axis if on_axis.any() else free, places[:, 2], -inf))
+        s = float(vertices[highest]) if pieces else 0.0
+        points = {**(points or {}), "pole": (s, 0.0)}
     middles = domain.geometry.x[compat.corner_numbers(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in pieces}
     return Meridian(domain, axis, ends, embedding, points, curvature, patches)

@@ -99,6 +99,32 @@ def test_drawn() -> None:
     assert areas == pytest.approx(exact, rel=3e-3)
 
 
+def test_highest_place_that_moves() -> None:
+    """w is of the pole of an upside-down shell, whose clamped rim is above it: as alone; a rim that is free counts."""
+    load = PRESSURE | {"on": {"upper": "outside"}}
+    _, seen = end({"shells": {"lower": cap(), "upper": placed(cap(), 3)}, "loading": load})
+    _, its = end(cap() | {"loading": PRESSURE})
+    assert seen["w_over_h"] == pytest.approx(its["w_over_h"], rel=1e-9)
+    free = {"shells": {"lower": cap(), "upper": placed(cap(hole=4) | {"boundary": {"hole": "clamped"}}, 3)}}
+    meridian = Scene(Case.from_source(free | {"loading": load})).model.meridian
+    assert meridian.section(np.array([meridian.points["pole"][0]]))[0, 1] == pytest.approx(3 - np.cos(np.radians(30)))
+
+
+def test_ball_on_one_of_two() -> None:
+    """A body that is placed `at` a shell comes along its normal: as on that shell alone, turned over or tilted."""
+    load = {"kind": "contact", "approach": 1, "points": 1}
+    on_shell = {"bodies": {"ball": {"kind": "sphere", "radius": 0.2}}, "loading": load}
+    _, one = end(cap() | on_shell)
+    ball = {"kind": "sphere", "radius": 0.2, "at": {"point": [0, 0, 2]}}
+    both = {"shells": {"lower": cap(), "upper": placed(cap(), 3)}, "bodies": {"ball": ball}, "loading": load}
+    _, two = end(both)
+    assert two["force"] == pytest.approx(one["force"], rel=1e-6)
+    tilted = {"shells": {"lower": cap(), "upper": placed(cap(), 3, 150)}, "loading": PRESSURE}
+    axis = np.array([0.5, 0.0, -np.sqrt(0.75)])
+    normal = Case.from_source(tilted).problem().shape.given.normal(np.add([0, 0, 3], axis))
+    assert normal == pytest.approx(axis, abs=1e-12)
+
+
 def touching(upper: dict[str, Any], z: float, load: dict[str, Any]) -> Scene:
     """Two shells that may touch."""
     shells = {"lower": cap(), "upper": placed(upper, z)}
