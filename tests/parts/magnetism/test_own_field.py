@@ -90,6 +90,7 @@ def test_the_case_hall_sensor() -> None:
 
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa"}
 STRIP = {"geometry": "strip", "radius": "30 mm", "width": 0.3, "thickness": "0.6 mm", "youngs_modulus": "1 MPa"}
+BLOCK = {**STRIP, "radius": "20 mm", "thickness": "2 mm"}
 SQUASHED = np.array([[1.2, 0.1, 0.0], [0.0, 0.9, 0.1], [0.1, 0.0, 0.6]])
 
 
@@ -236,6 +237,13 @@ KINDS = {
         {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5, "thickness_factor": "1 + z/4"},
         {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"}, "applied": {"flux_density": "30 mT"},
          "remanence": "rotation"}, {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "solid": lambda: made(BLOCK, {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
+                                                        "flux_density": "60 mT"}},
+                          {"hall": {"position": [12 * MM, 1 * MM, 4 * MM], "field": "total"}}, symmetry="none",
+                          model="solid", mesh={"refinement": 0.3}),
+    "half solid, rotation law, soft": lambda: made(BLOCK, {**FIELD, "susceptibility": "1 + x", "remanence": "rotation"},
+                                                   {"hall": {"position": [12 * MM, 1 * MM, 4 * MM]}}, symmetry="half",
+                                                   model="solid", mesh={"refinement": 0.3}, loading={"kind": "field"}),
 }  # fmt: skip
 
 
