@@ -128,19 +128,19 @@ def turned(F: np.ndarray) -> np.ndarray:
             {"remanent": VARIED},
             lambda X, F: np.einsum("...ij,...j->...i", F, np.stack([1 + X[..., 0], X[..., 1], X[..., 2] * X[..., 0]
                                                                     + X[..., 0] ** 2], axis=-1)),
-            1e-7,
+            1e-8,
         ),
         (
             {"remanent": VARIED, "remanence": "rotation"},
             lambda X, F: np.einsum("...ij,...j->...i", turned(F), np.stack([1 + X[..., 0], X[..., 1], X[..., 2]
                                                                             * X[..., 0] + X[..., 0] ** 2], axis=-1)),
-            1e-5,
+            1e-7,
         ),
         (
             {"remanent": {"kind": "layers", "layers": [{"fraction": 0.5, "polar": 90}, {"fraction": 0.5, "polar": 0}],
                           "flux_density": "60 mT"}},
             lambda X, F: np.where((X[..., 2] < 0)[..., None], F[..., :, 0], F[..., :, 2]),
-            1e-7,
+            1e-8,
         ),
     ],
 )  # fmt: skip
