@@ -45,6 +45,9 @@ SEEN = {  # of its square or cube: the middle, middles of opposite sides one aft
 }
 
 
+Layer = tuple[Any, tuple[Array, Array, Array]]  # a height, and what B, B_a and B_b are multiplied by
+
+
 class TooNear(ValueError):
     """Places are on the surface of the shell, or in it.
 
@@ -236,17 +239,20 @@ class Faces(Family):
         return np.asarray((np.abs(across) <= foot.thickness / 2) & (beside < BESIDE))[:, 0]
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
-        at = self._jets(boxes, x)
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._parts
-        layers: list[tuple[float, tuple[Array, Array, Array]]] = []
-        for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
-            G1, G2, _ = at.layer(eta)
-            layers.append((eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1)))
-        for eta, weight in self._inside:
-            G1, G2, G3 = at.layer(eta)
-            density = -(weight * area)[..., None]
-            layers.append((eta, (0 * G1, density * np.cross(G2, G3), density * np.cross(G3, G1))))
-        return _found(at, layers, into)
+
+        def layers(at: Jets) -> list[Layer]:
+            made = list[Layer]()
+            for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
+                G1, G2, _ = at.layer(eta)
+                made.append((eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1)))
+            for eta, weight in self._inside:
+                G1, G2, G3 = at.layer(eta)
+                density = -(weight * area)[..., None]
+                made.append((eta, (0 * G1, density * np.cross(G2, G3), density * np.cross(G3, G1))))
+            return made
+
+        return _found(self._jets(boxes, x), layers, into)
 
 
 class Sides(Family):
@@ -285,10 +291,14 @@ class Sides(Family):
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at, along, eta = self._jets(boxes, x)
         area = np.prod(boxes.size, axis=1)[:, None] * weights / (self._parts if self.shape.swept else 1)
-        G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
-        tangent = along[:, None, :1] * G1 + along[:, None, 1:] * G2
-        outward = area[..., None] * np.cross(tangent, G3)
-        return _found(at, [(eta[..., None], (outward, 0 * outward, 0 * outward))], into)
+
+        def layers(at: Jets) -> list[Layer]:
+            G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
+            tangent = along[:, None, :1] * G1 + along[:, None, 1:] * G2
+            outward = area[..., None] * np.cross(tangent, G3)
+            return [(eta[..., None], (outward, 0 * outward, 0 * outward))]
+
+        return _found(at, layers, into)
 
 
 def heights(faces: Faces) -> Array:
@@ -302,12 +312,16 @@ def _through() -> tuple[Array, Array]:
     return x - 0.5, w
 
 
-def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], into: Nodal | None) -> Found:
-    """Charges of layers, each with its height and with what B, B_a and B_b are multiplied by."""
-    n = unit(np.cross(at.r[1], at.r[2]))
+def _found(at: Jets, layers_of: Callable[[Jets], list[Layer]], into: Nodal | None) -> Found:
+    """Charges of layers."""
+    n, layers = unit(np.cross(at.r[1], at.r[2])), layers_of(at)
     thickness = at.thickness[..., None]
     x = np.stack([at.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
-    q = np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+
+    def charges(layers: list[Layer]) -> Array:
+        return np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+
+    q = charges(layers)
     if into is None:
         return Found(x, q)
 
@@ -315,6 +329,7 @@ def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], i
         heights = np.stack([eta * thickness + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
         by_B = [sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)]
         at.back(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
+        at.back_of_undeformed(into, lambda other: charges(layers_of(other)), on_q)
 
     return Found(x, q, back)
 

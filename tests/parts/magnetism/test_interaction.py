@@ -405,7 +405,7 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
     term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
     rng, u, v = np.random.default_rng(0), scene.model.u, fem.Function(scene.model.V)
     u.x.array[:], v.x.array[:] = (size * rng.standard_normal(len(u.x.array)) for size in (1e-3, 1.0))
-    (Br, by_energy), (_, by_force) = term.by_field(v, 1.0, 0.0), term.by_field(v, 0.0, 1.0)
+    (Br, by_energy), (_, by_force) = (term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
     change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
     own, forces, energies = own_field(term._sight), list[float](), list[float]()
     own.edges = own.chargeable  # the change has charges on edges between cells
