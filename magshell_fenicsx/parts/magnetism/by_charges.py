@@ -95,9 +95,9 @@ def add_heights(
     return one, other
 
 
-def _along(points: Points, rows: Ints, nodes: Complex, same: bool) -> tuple[Complex, Complex]:
-    """Places and normals (3, n, 1 or P, charges) of points of elements `rows`."""
+def _along(points: Points, rows: Ints, nodes: Complex, same: bool) -> tuple[list[Complex], list[Complex]]:
+    """Components (n, 1 or P, charges) of places and normals of points of elements `rows`."""
     _, n, x = places(points, rows, nodes)
     shape = len(x), 1 if same else x.shape[1], -1, 3
-    n = np.broadcast_to(n[..., None, :], x.shape)
-    return np.moveaxis(x.reshape(shape), -1, 0), np.moveaxis(n.reshape(shape), -1, 0)
+    each = x.reshape(shape), np.broadcast_to(n[..., None, :], x.shape).reshape(shape)
+    return [each[0][..., i] for i in range(3)], [each[1][..., i] for i in range(3)]

@@ -218,14 +218,18 @@ class Jets:
         if into.by_place is None or into.by_thickness is None:
             return
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
+
+        def rate(**moved: Any) -> Array:
+            return np.asarray(np.sum(on * of(replace(self, **moved)).imag, axis=-1) / STEP, dtype=np.float64)
+
         for d, i in product(range(1, 6), range(3)):
             r0 = self.r0.astype(np.complex128)
             r0[d, ..., i] += STEP * 1j
-            by_r0[d, ..., i] = np.sum(on * of(replace(self, r0=r0)).imag, axis=-1) / STEP
+            by_r0[d, ..., i] = rate(r0=r0)
         for d in range(3):
             t = self.t.astype(np.complex128)
             t[d] += STEP * 1j
-            by_t[d] = np.sum(on * of(replace(self, t=t)).imag, axis=-1) / STEP
+            by_t[d] = rate(t=t)
         np.add.at(into.by_place, self.cells, np.einsum("dnmk,dnmi->nki", self.shapes, by_r0))
         if self.shape.thick:
             X, slopes, _ = self.shape.reference(self.ab)

@@ -9,6 +9,7 @@ D = dM/du^T G dM/du + L . d2M/du2. Moments go up to larger boxes and L comes dow
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,11 +129,11 @@ class Far:
         upwards = np.concatenate(normals)[self._order] / width
         n, dn = upwards.real, upwards.imag / STEP
 
-        def along(v: Array, Y: Array) -> Array:
+        def along(v: NDArray[np.floating[Any]], Y: Array) -> Array:
             return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
         dY, nY = along(rate, Y), along(n, Y)
-        dnY = along(rate, nY) + along(dn, Y)
+        dnY = np.asarray(along(rate, nY) + along(dn, Y))
         L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
         by = np.empty((2, len(self._q)))
         for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):

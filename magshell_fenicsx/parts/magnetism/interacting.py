@@ -199,13 +199,11 @@ class InteractionTerm:
         part = slice(own_cells.start, own_cells.stop)
         if of_shape:
             into = self._charged.by_fields(nodes, turned, own_cells, weights, of_shape=True)
-            f, found = self._model.r0, into.by_place
+            by_place, by_thickness = (self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness))
             if name == "thickness":
-                f, found = self._model.thickness, into.by_thickness[..., None]
-            found = self._comm.allreduce(found)[part]
-            if name == "r0":
-                found = found + self._at_fixed_charges(direction, energy, force)
-            return f, found
+                assert self._model.thickness
+                return self._model.thickness, np.asarray(by_thickness[..., None])
+            return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
         if name != own.Br.name:
             return None
         shape, cells, edges = self._all(may=True)
@@ -271,8 +269,8 @@ class InteractionTerm:
         """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes them changed."""
         r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
-        factor = self._model.thickness
-        given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
+        factor, of_nodes = self._model.thickness, own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list]
+        given: tuple[Array, ...] = (r0, self._cells.gathered(of_nodes))
         if factor is not None:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
