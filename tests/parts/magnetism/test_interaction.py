@@ -399,7 +399,11 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("interaction", "symmetry"),
-    [("others", "none"), ("others", "half"), pytest.param("all", "half", marks=pytest.mark.slow)],
+    [
+        ("others", "half"),
+        pytest.param("others", "none", marks=pytest.mark.slow),
+        pytest.param("all", "half", marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_by_thickness_and_place(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interaction: str, symmetry: str
