@@ -59,7 +59,8 @@ class OwnField:
         self._pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
         self.Br = self._given()
         self._plain = of.law == "deformation" and of.soft is None
-        self._at = self._element()
+        if not self._plain:
+            self._at = self._element()
         self.edges = self._sides()
         self._sign = self._parity()
 
