@@ -43,8 +43,13 @@ class KnowsFields(Protocol):
     @property
     def amplitude(self) -> str | None: ...
 
-    def by_field(self, direction: fem.Function, energy: float, force: float) -> tuple[fem.Function, Array]:
-        """A field, and the derivatives of energy Pi + force v . dPi/du by its values in own cells. Collective."""
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """A field, and the derivatives of energy Pi + force v . dPi/du by its values in own cells. Collective.
+
+        None if the term has no field of that name.
+        """
 
 
 def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:

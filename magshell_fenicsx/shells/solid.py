@@ -28,7 +28,13 @@ from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
 from magshell_fenicsx.models.shell.parameters import Condition, Material
-from magshell_fenicsx.models.shell.patterns import ByPatch, Components, cells_of_body, places_in_body
+from magshell_fenicsx.models.shell.patterns import (
+    ByPatch,
+    Components,
+    cells_of_body,
+    field_in_body,
+    places_in_body,
+)
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
@@ -41,7 +47,7 @@ from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, 
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
 from magshell_fenicsx.shells.observed import Observed
 from magshell_fenicsx.shells.solid_sites import make_sites
-from magshell_fenicsx.shells.solid_terms import Density, TermFactory, field_in_body
+from magshell_fenicsx.shells.solid_terms import Density, TermFactory
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -89,8 +95,8 @@ class SolidModel(Observed):
         loads: Loads,
         mirror: Mirror = Y0,
     ) -> None:
-        if loads.magnetic:
-            loads = replace(loads, magnetic=_in_cells(loads.magnetic, body))
+        magnetic, remanence = (field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence))
+        loads = replace(loads, magnetic=magnetic, remanence=remanence)
         self.body, self.material, self.law = body, material, law
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -190,6 +196,10 @@ class SolidModel(Observed):
         inside = (low < height - ROUNDING) & (height < high + ROUNDING)
         part = (height - low[inside]) / (high - low)[inside]
         return Curve.of(self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0))
+
+    @property
+    def mirrored_facets(self) -> NDArray[np.int32]:
+        return np.asarray(np.concatenate([np.empty(0, dtype=np.int32), *self._faces]))
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]

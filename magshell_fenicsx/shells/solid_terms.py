@@ -18,15 +18,7 @@ from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, WHOLE, Body, face_mea
 from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import (
-    Pattern,
-    cells_of_body,
-    inside,
-    places_in_body,
-    radial,
-    refuse_unbounded,
-    shown,
-)
+from magshell_fenicsx.models.shell.patterns import field_in_body, radial
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
@@ -352,29 +344,3 @@ class TermFactory:
 
     def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:
         return tuple(fem.Constant(self.body.mesh, value) for value in values)
-
-
-def field_in_body(
-    pattern: Pattern, V: fem.FunctionSpace, *, name: str = "Br", key: str = "magnetic.remanent", size: int = 3
-) -> fem.Function:
-    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell; collective.
-
-    Parameters
-    ----------
-    name
-        Of the field.
-    key
-        Of the case, for the message.
-
-    Raises
-    ------
-    MeshError
-        On every rank, if it has no finite value somewhere.
-    """
-    nodes, normals = places_in_body(V)
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (size,)))
-    field = fem.Function(Q, name=name)
-    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm, key)
-    fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
-    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
-    return field

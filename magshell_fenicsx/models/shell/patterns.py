@@ -365,6 +365,32 @@ def places_in_body(V: fem.FunctionSpace) -> tuple[Array, Array]:
     return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
+def field_in_body(
+    pattern: Pattern, V: fem.FunctionSpace, *, name: str = "Br", key: str = "magnetic.remanent", size: int = 3
+) -> fem.Function:
+    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Parameters
+    ----------
+    name
+        Of the field.
+    key
+        Of the case, for the message.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it has no finite value somewhere.
+    """
+    nodes, normals = places_in_body(V)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (size,)))
+    field = fem.Function(Q, name=name)
+    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm, key)
+    fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
+    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
+    return field
+
+
 def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:
     """Look at vectors and places (cells, nodes, 3) of a key of the case; collective.
 

@@ -28,6 +28,7 @@ BODY, TALLEST = 0.78, 2.0  # of a panel's width: how wide and tall its map is
 PARALLEL = 1 - 1e-12
 ON_PLANE = 1e-9  # over R
 DENSITY = 1.2  # of lines
+SHORT = 1e-7  # a line of no length, relative: where a corner is on the plane
 LINE_WIDTH, TINY = 0.6, 1e-300  # points: around the section of the shell, whose thickness is true
 
 
@@ -76,7 +77,7 @@ def plane_of(grid: Grid) -> Grid:
 
 
 def section(surface: Surface, grid: Grid) -> Array:
-    """Where the deformed mid-surface meets the plane of a grid: lines (n, 2, 3), over R."""
+    """Where the deformed mid-surface, or the surface of a solid, meets the plane of a grid: lines (n, 2, 3), over R."""
     pieces = tessellated(surface)
     places = pieces.at(surface.r0 + surface.u)
     normal = np.cross(*grid.sides)
@@ -124,13 +125,42 @@ def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: 
     bar = axes.figure.colorbar(image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05)
     if not wide:
         bar.ax.xaxis.set_major_formatter(number_format())
-    flat = np.stack([lines @ e for e in units], axis=-1)
-    along_line = flat[:, 1] - flat[:, 0]
-    across = np.stack([-along_line[:, 1], along_line[:, 0]], axis=-1)
+    flat = length * np.stack([lines @ e for e in units], axis=-1)
+    drawn = outlines(flat) if surface.is_body else list(_thickened(flat, length * h))
+    axes.add_collection(PolyCollection(drawn, color="0.15", linewidth=LINE_WIDTH), autolim=False)
+
+
+def _thickened(lines: Array, h: float) -> Array:
+    """Lines (n, 2, 2) as rectangles (n, 4, 2) of a width."""
+    along = lines[:, 1] - lines[:, 0]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     across *= h / 2 / np.maximum(np.linalg.norm(across, axis=1), TINY)[:, None]
-    ends = (flat[:, 0] - across, flat[:, 1] - across, flat[:, 1] + across, flat[:, 0] + across)
-    drawn = length * np.stack(ends, axis=1)
-    axes.add_collection(PolyCollection(list(drawn), color="0.15", linewidth=LINE_WIDTH), autolim=False)
+    return np.stack([lines[:, 0] - across, lines[:, 1] - across, lines[:, 1] + across, lines[:, 0] + across], axis=1)
+
+
+def outlines(lines: Array) -> list[Array]:
+    """The polygons that lines (n, 2, 2) with common ends make, in any order."""
+    from scipy.spatial import cKDTree  # takes long to import
+
+    lines = lines[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) > SHORT * np.abs(lines).max(initial=0.0)]
+    if not len(lines):
+        return []
+    ends = lines.reshape(-1, 2)
+    nearest, own = cKDTree(ends).query(ends, k=2)[1], np.arange(len(ends))
+    beside = np.where(nearest[:, 0] == own, nearest[:, 1], nearest[:, 0])
+    left, polygons = set(range(len(lines))), list[Array]()
+    while left:
+        line, polygon = left.pop(), list[Array]()
+        end = 2 * line + 1
+        while True:
+            polygon.append(ends[end])
+            following = int(beside[end])
+            if following // 2 not in left:
+                break
+            left.remove(following // 2)
+            end = following ^ 1  # the other end of that line
+        polygons.append(np.array(polygon))
+    return polygons
 
 
 def masked(values: Array) -> Any:

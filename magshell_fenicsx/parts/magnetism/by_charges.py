@@ -1,4 +1,4 @@
-"""Derivatives of the energy of charges, and of its forces along a displacement, by the charges themselves.
+"""Derivatives of the energy of charges, and of its forces along a displacement, by the charges and by their heights.
 
 The energy W = sum of q_i q_j/|x_i - x_j| has dW/dq_i = sum of q_j/|x_i - x_j|, and of v . dW/du the rate of that along
 v. Places are found with rates of nodes as imaginary parts, times a step so small that their own are exact to rounding
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.pairs import Points
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int64]
-STEP = 1e-30  # of the imaginary part
 CHUNK = 400_000  # pairs of charges at once
 
 
@@ -67,3 +67,37 @@ def add(
         np.add.at(one, left[1][some], (seen @ p[..., None])[..., 0].reshape(n, *one.shape[1:]))
         np.add.at(other, right[1][some], (q[..., None, :] @ seen)[..., 0, :].reshape(n, *other.shape[1:]))
     return one, other
+
+
+def add_heights(
+    nodes: Complex, cells: Ints, left: tuple[Points, Ints], right: tuple[Points, Ints], weights: Weights
+) -> tuple[Array, Array]:
+    """As `add`, by the heights of the charges over the mid-surface."""
+    one, other = (np.zeros_like(points.q) for points, _ in (left, right))
+    same = right[0].tables.ndim == 3
+    size = left[0].q[0].size * (right[0].q[0].size if same else right[0].q[0, 0].size)
+    step = max(1, CHUNK // (4 * size))
+    for first in range(0, len(cells), step):
+        some = slice(first, first + step)
+        x, y = (_along(of, rows[some], nodes[cells[some, i]], same) for i, (of, rows) in enumerate((left, right)))
+        d = [a[..., :, None] - b[..., None, :] for a, b in zip(x[0], y[0], strict=True)]
+        square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        share = 1 / (square * np.sqrt(square))
+        q, p = (of.q[rows[some]].reshape(len(square), square.shape[1], -1) for of, rows in (left, right))
+        on_one, on_other = np.zeros(x[0][0].shape, complex), np.zeros(y[0][0].shape, complex)
+        for each, n, m in zip(d, x[1], y[1], strict=True):
+            force = share * each
+            on_one -= n * (force @ p[..., None])[..., 0]
+            on_other += m * (q[..., None, :] @ force)[..., 0, :]
+        for total, of, on in ((one, left, q * on_one), (other, right, p * on_other)):
+            seen = weights.energy * on.real + weights.force * on.imag / STEP
+            np.add.at(total, of[1][some], seen.reshape(len(seen), *total.shape[1:]))
+    return one, other
+
+
+def _along(points: Points, rows: Ints, nodes: Complex, same: bool) -> tuple[list[Complex], list[Complex]]:
+    """Components (n, 1 or P, charges) of places and normals of points of elements `rows`."""
+    _, n, x = places(points, rows, nodes)
+    shape = len(x), 1 if same else x.shape[1], -1, 3
+    each = x.reshape(shape), np.broadcast_to(n[..., None, :], x.shape).reshape(shape)
+    return [each[0][..., i] for i in range(3)], [each[1][..., i] for i in range(3)]

@@ -1,6 +1,8 @@
 """A magnetised shell at points of its cells, with coordinates (a, b) in [0, 1]² that triangles and rings share."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -8,14 +10,24 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
+STEP = 1e-30  # of imaginary changes
 
 
 @dataclass
 class Nodal:
-    """Derivatives by the displacement and by the remanence at the nodes of cells, (cells, nodes, 3) each."""
+    """Derivatives by the displacement and by the remanence at the nodes of cells, (cells, nodes, 3) each.
+
+    Attributes
+    ----------
+    by_place, by_thickness
+        The same by the undeformed place and (cells, nodes) by what multiplies the thickness, at nodes of their
+        elements; None if nobody asks for them.
+    """
 
     by_u: Array
     by_remanence: Array
+    by_place: Array | None = None
+    by_thickness: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +85,20 @@ class Shape:
         element, values = self.thick
         return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 
+    def nothing(self, *, of_shape: bool = False) -> Nodal:
+        """Derivatives to add to; `of_shape`: those by the undeformed place and the thickness too."""
+        zero = Nodal(np.zeros_like(self.r0), np.zeros_like(self.remanence))
+        if not of_shape:
+            return zero
+        thick = np.zeros((len(self.r0), 0)) if self.thick is None else np.zeros_like(self.thick[1])
+        return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=thick)
+
+    def back_of_thickness(self, cells: Ints, X: Array, on: Array, into: Nodal) -> None:
+        """Add what thicknesses (n, m) in cells (n,) have at places X (m, d) of their reference cell."""
+        if self.thick and into.by_thickness is not None:
+            T = self.thick[0].tabulate(0, X)[0, :, :, 0]
+            np.add.at(into.by_thickness, cells, self.h * on @ T)
+
 
 def tables(element: Any, X: Array, order: int) -> Array:
     """(derivatives, n, m, nodes) of an element at places (n, m, d)."""
@@ -108,6 +134,7 @@ class Jets:
     shapes: Array
     of_B: Array
     angle: Array
+    ab: Array
 
     @classmethod
     def of(cls, shape: Shape, cells: Ints, ab: Array, turn: Array | None = None) -> "Jets":
@@ -125,14 +152,14 @@ class Jets:
             t = shape.thickness(cells, X)
             t = np.stack([t[0], t[1], 0 * t[0]])
             r0, u = jets
-            return cls(r0, r0[:3] + u[:3], fields, t, shape, cells, T, TB, angle)
+            return cls(r0, r0[:3] + u[:3], fields, t, shape, cells, T, TB, angle, ab)
         T, TB = _chain(T, slopes, ab), _chain(TB, slopes, ab)
         r0, u = (np.einsum("dnmk,nki->dnmi", T, each[cells]) for each in (shape.r0, shape.u))
         t = shape.thickness(cells, X)
         if len(t) > 1:
             t = np.concatenate([t[:1], np.einsum("nmad,dnm->anm", slopes, t[1:3])])
         B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
-        return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T[:3], TB, angle)
+        return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T, TB, angle, ab)
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
         """dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at a height over the thickness."""
@@ -178,10 +205,36 @@ class Jets:
             of_B[0][..., 1] -= ring * on_B[2][..., 0]
             by_B = np.einsum("dnmk,dnmi->nki", self.of_B[:2], of_B)
         else:
-            by_u = np.einsum("dnmk,dnmi->nki", self.shapes, on)
+            by_u = np.einsum("dnmk,dnmi->nki", self.shapes[:3], on)
             by_B = np.einsum("dnmk,dnmi->nki", self.of_B, on_B)
         np.add.at(into.by_u, self.cells, by_u)
         np.add.at(into.by_remanence, self.cells, by_B)
+
+    def back_of_undeformed(self, into: Nodal, of: "Callable[[Jets], Array]", on: Array) -> None:
+        """Add what numbers (n, m, l) of the jets of r0 and of the thickness have, times `on`; of triangles.
+
+        Their derivatives at each point are those along an imaginary change, exact to rounding.
+        """
+        if into.by_place is None or into.by_thickness is None:
+            return
+        by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
+
+        def rate(**moved: Any) -> Array:
+            return np.asarray(np.sum(on * of(replace(self, **moved)).imag, axis=-1) / STEP, dtype=np.float64)
+
+        for d, i in product(range(1, 6), range(3)):
+            r0 = self.r0.astype(np.complex128)
+            r0[d, ..., i] += STEP * 1j
+            by_r0[d, ..., i] = rate(r0=r0)
+        for d in range(3):
+            t = self.t.astype(np.complex128)
+            t[d] += STEP * 1j
+            by_t[d] = rate(t=t)
+        np.add.at(into.by_place, self.cells, np.einsum("dnmk,dnmi->nki", self.shapes, by_r0))
+        if self.shape.thick:
+            X, slopes, _ = self.shape.reference(self.ab)
+            T = _chain(tables(self.shape.thick[0], X, 1), slopes, self.ab)
+            np.add.at(into.by_thickness, self.cells, self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t))
 
 
 def unit(m: Array) -> Array:
@@ -192,7 +245,7 @@ def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
     """The normal of a jet (6, ..., 3), and its derivatives."""
     _, a1, a2, a11, a12, a22 = jet
     m = np.cross(a1, a2)
-    size = np.linalg.norm(m, axis=-1, keepdims=True)
+    size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # analytic
     n, slopes = m / size, []
     for first, second in ((a11, a12), (a12, a22)):
         change = (np.cross(first, a2) + np.cross(a1, second)) / size

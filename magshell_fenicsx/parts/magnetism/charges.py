@@ -14,7 +14,8 @@ from the place: exact at any distance, as there is nothing else in it but the th
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from itertools import product
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,19 @@ SIDE = 9
 GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, SIDE)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # of a box
 NEWTON, BESIDE = 15, 1e-6  # steps to the foot of a place in a box, and over R
 INSIDE = 1e-3  # of a box, as at a corner it may have no normal
-SEEN = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5], [0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]])  # of its square
+SEEN = {  # of its square or cube: the middle, middles of opposite sides one after the other, corners
+    d: np.array(
+        [
+            np.full(d, 0.5),
+            *(np.where(np.arange(d) == along, end, 0.5) for along in range(d) for end in (0.0, 1.0)),
+            *product((0.0, 1.0), repeat=d),
+        ]
+    )
+    for d in (2, 3)
+}
+
+
+Layer = tuple[Any, tuple[Array, Array, Array]]  # a height, and what B, B_a and B_b are multiplied by
 
 
 class TooNear(ValueError):
@@ -58,14 +71,14 @@ def gauss(n: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes of the coordinates (a, b) in [0, 1]² of some elements.
+    """Boxes of the coordinates (a, b) in [0, 1]² of some elements, or (a, b, c) in [0, 1]³.
 
     Attributes
     ----------
     of
         (n,) the elements.
     low, size
-        (n, 2) corners and sides.
+        (n, 2 or 3) corners and sides.
     """
 
     of: Ints
@@ -73,8 +86,8 @@ class Boxes:
     size: Array
 
     @classmethod
-    def whole(cls, count: int) -> "Boxes":
-        return cls(np.arange(count), np.zeros((count, 2)), np.ones((count, 2)))
+    def whole(cls, count: int, across: int = 2) -> "Boxes":
+        return cls(np.arange(count), np.zeros((count, across)), np.ones((count, across)))
 
     def __getitem__(self, which: Any) -> "Boxes":
         return Boxes(self.of[which], self.low[which], self.size[which])
@@ -89,7 +102,7 @@ class Boxes:
         return Boxes(np.tile(self.of, 2), np.concatenate([self.low, second]), np.tile(size, (2, 1)))
 
     def points(self, x: Array) -> Array:
-        """(n, m, 2) of points (m, 2) of the unit square."""
+        """(n, m, 2 or 3) of points (m, 2 or 3) of the unit square or cube."""
         return np.asarray(self.low[:, None] + self.size[:, None] * x)
 
 
@@ -113,9 +126,10 @@ class Found:
 
 
 class Family:
-    """Elements with coordinates (a, b), of which charges can be found."""
+    """Elements with coordinates (a, b), or (a, b, c) where they are solid, of which charges can be found."""
 
     count: int
+    across: ClassVar[int] = 2  # how many coordinates there are
 
     def middle(self, boxes: Boxes, x: Array) -> Array:
         """Places (n, m, k, 3) of points of boxes, k of them through the thickness."""
@@ -135,23 +149,25 @@ class Family:
         TooNear
             If a place is in the shell's surface, when all others have their boxes.
         """
-        corners = np.clip(SEEN, INSIDE, 1 - INSIDE)
-        boxes, where = Boxes.whole(self.count), np.repeat(np.arange(len(places)), self.count)
+        corners = np.clip(SEEN[self.across], INSIDE, 1 - INSIDE)
+        boxes = Boxes.whole(self.count, self.across)
+        where = np.repeat(np.arange(len(places)), self.count)
         which = np.tile(np.arange(self.count), len(places))
         for _ in range(MOST):
             if not len(which):
                 return
             x = self.middle(boxes, corners)
-            centre = x[:, 4]
-            radius = np.sqrt(((x - x[:, 4:5]) ** 2).sum(axis=-1)).max(axis=(1, 2))
+            centre = x[:, 0]
+            radius = np.sqrt(((x - x[:, :1]) ** 2).sum(axis=-1)).max(axis=(1, 2))
             gap = np.linalg.norm(places[where][:, None] - centre[which], axis=-1).min(axis=-1)
             far = gap > FAR * radius[which]
             if far.any():
                 yield boxes, which[far], where[far]
             halved, which = np.unique(which[~far], return_inverse=True)
             where, x = where[~far], x[halved]
-            sides = [np.linalg.norm(x[:, i] - x[:, j], axis=-1).max(axis=-1) for i, j in ((7, 8), (5, 6))]
-            boxes = boxes[halved].halves((sides[1] > sides[0]).astype(np.intp))
+            ends = x[:, 1 : 1 + 2 * self.across]
+            sides = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).max(axis=-1)
+            boxes = boxes[halved].halves(sides.argmax(axis=1))
             which, where = np.concatenate([which, which + len(halved)]), np.tile(where, 2)
         if len(which):
             raise TooNear(np.unique(where))
@@ -223,17 +239,20 @@ class Faces(Family):
         return np.asarray((np.abs(across) <= foot.thickness / 2) & (beside < BESIDE))[:, 0]
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
-        at = self._jets(boxes, x)
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._parts
-        layers: list[tuple[float, tuple[Array, Array, Array]]] = []
-        for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
-            G1, G2, _ = at.layer(eta)
-            layers.append((eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1)))
-        for eta, weight in self._inside:
-            G1, G2, G3 = at.layer(eta)
-            density = -(weight * area)[..., None]
-            layers.append((eta, (0 * G1, density * np.cross(G2, G3), density * np.cross(G3, G1))))
-        return _found(at, layers, into)
+
+        def layers(at: Jets) -> list[Layer]:
+            made = list[Layer]()
+            for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
+                G1, G2, _ = at.layer(eta)
+                made.append((eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1)))
+            for eta, weight in self._inside:
+                G1, G2, G3 = at.layer(eta)
+                density = -(weight * area)[..., None]
+                made.append((eta, (0 * G1, density * np.cross(G2, G3), density * np.cross(G3, G1))))
+            return made
+
+        return _found(self._jets(boxes, x), layers, into)
 
 
 class Sides(Family):
@@ -272,10 +291,14 @@ class Sides(Family):
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at, along, eta = self._jets(boxes, x)
         area = np.prod(boxes.size, axis=1)[:, None] * weights / (self._parts if self.shape.swept else 1)
-        G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
-        tangent = along[:, None, :1] * G1 + along[:, None, 1:] * G2
-        outward = area[..., None] * np.cross(tangent, G3)
-        return _found(at, [(eta[..., None], (outward, 0 * outward, 0 * outward))], into)
+
+        def layers(at: Jets) -> list[Layer]:
+            G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
+            tangent = along[:, None, :1] * G1 + along[:, None, 1:] * G2
+            outward = area[..., None] * np.cross(tangent, G3)
+            return [(eta[..., None], (outward, 0 * outward, 0 * outward))]
+
+        return _found(at, layers, into)
 
 
 def heights(faces: Faces) -> Array:
@@ -289,12 +312,16 @@ def _through() -> tuple[Array, Array]:
     return x - 0.5, w
 
 
-def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], into: Nodal | None) -> Found:
-    """Charges of layers, each with its height and with what B, B_a and B_b are multiplied by."""
-    n = unit(np.cross(at.r[1], at.r[2]))
+def _found(at: Jets, layers_of: Callable[[Jets], list[Layer]], into: Nodal | None) -> Found:
+    """Charges of layers."""
+    n, layers = unit(np.cross(at.r[1], at.r[2])), layers_of(at)
     thickness = at.thickness[..., None]
     x = np.stack([at.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
-    q = np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+
+    def charges(layers: list[Layer]) -> Array:
+        return np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+
+    q = charges(layers)
     if into is None:
         return Found(x, q)
 
@@ -302,14 +329,16 @@ def _found(at: Jets, layers: Sequence[tuple[Any, tuple[Array, Array, Array]]], i
         heights = np.stack([eta * thickness + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
         by_B = [sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)]
         at.back(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
+        at.back_of_undeformed(into, lambda other: charges(layers_of(other)), on_q)
 
     return Found(x, q, back)
 
 
 def field(families: Sequence[Family], places: Array) -> Array:
     """B (n, 3) at places (n, 3), of these charges; nan in the shell's surface."""
-    B, (rule, weights) = np.zeros_like(places), square(POINTS)
+    B = np.zeros_like(places)
     for family in families:
+        rule, weights = cube(POINTS, family.across)
         for some in _parts(len(places), family.count):
             try:
                 for boxes, which, where in family.near(places[some]):
@@ -343,14 +372,14 @@ def gradient(families: Sequence[Family], place: Array, e: Array, into: Nodal) ->
         If it is in the shell's surface.
     """
     value = 0.0
-    rule, weights = square(POINTS)
     parts = (
         (family, part)
         for family in families
         for boxes, which, _ in family.near(place[None])
-        for part in _chunks(boxes[which], len(weights))
+        for part in _chunks(boxes[which], POINTS**family.across)
     )
     for family, part in parts:
+        rule, weights = cube(POINTS, family.across)
         at = family.at(part, rule, weights, into)
         d = place - at.x
         r = np.linalg.norm(d, axis=-1)
@@ -366,18 +395,19 @@ def moment(families: Sequence[Family]) -> Array:
     """The sum of q x, (3,): the integral of the remanence as the shell carries it."""
     total = np.zeros(3)
     for family in families:
-        rule, weights = square(POINTS)
-        for part in _chunks(Boxes.whole(family.count), len(weights)):
+        rule, weights = cube(POINTS, family.across)
+        for part in _chunks(Boxes.whole(family.count, family.across), len(weights)):
             at = family.at(part, rule, weights)
             total += np.einsum("nml,nmli->i", at.q, at.x)
     return total
 
 
-def square(n: int) -> tuple[Array, Array]:
-    """Gauss's rule on the unit square."""
+@cache
+def cube(n: int, across: int = 3) -> tuple[Array, Array]:
+    """Gauss's rule on the unit cube, or the square."""
     x, w = gauss(n)
-    points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(points), np.asarray(np.outer(w, w).ravel())
+    points, weights = (np.stack(np.meshgrid(*[each] * across, indexing="ij"), axis=-1) for each in (x, w))
+    return points.reshape(-1, across), weights.prod(axis=-1).ravel()
 
 
 def _chunks(boxes: Boxes, points: int) -> Iterator[Boxes]:
@@ -401,7 +431,7 @@ def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
         np.tile(low, (family.count, 1)),
         np.full((family.count * count, 2), 1 / parts),
     )
-    corners, (rule, weights) = np.clip(AROUND, TINY, 1 - TINY), square(3)
+    corners, (rule, weights) = np.clip(AROUND, TINY, 1 - TINY), cube(3, 2)
     flat = []
     for part in _chunks(boxes, len(weights)):
         x = family.at(part, corners, np.zeros(len(corners))).x

@@ -18,8 +18,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import STEP, Weights, add
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.by_charges import Weights, add, add_heights
+from magshell_fenicsx.parts.magnetism.charged import STEP, Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
@@ -89,8 +89,11 @@ class Kind:
     def _side(self, which: int) -> Points:
         s, eta, points, weights = self._on_side(which)
         q = self.family.at(Boxes.whole(self.family.count), points, weights).q.reshape(-1, len(s), len(eta))
-        X = [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][self._edge or 0]
-        return self._made(X, eta - 0.5, q)
+        return self._made(self._along(s), eta - 0.5, q)
+
+    def _along(self, s: Array) -> Array:
+        """Points of the reference triangle on the edge."""
+        return [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][self._edge or 0]
 
     def _on_side(self, which: int) -> tuple[Array, Array, Array, Array]:
         """Coordinates along the edge and through the thickness, all pairs of these, and weights."""
@@ -100,13 +103,19 @@ class Kind:
         return s, eta, points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
 
     def back(self, which: int, on_q: Array, into: Nodal) -> None:
-        """From derivatives by the charges of a rule, those by the remanence."""
+        """From derivatives by the charges of a rule, those by what `into` has: all that they follow from."""
         count, boxes = len(self._copies.images), Boxes.whole(self.family.count)
         on = np.einsum("c,c...->...", self._copies.charges, on_q.reshape(count, -1, *on_q.shape[1:]))
         at = self._on_face(which)[1:] if self._edge is None else self._on_side(which)[2:]
         made = self.family.at(boxes, *at, into)
         assert made.back
         made.back(np.zeros_like(made.x), on.reshape(made.q.shape))
+
+    def back_of_heights(self, which: int, on: Array, into: Nodal) -> None:
+        """From derivatives by the heights of the charges of a rule, those by the thickness."""
+        X = self._on_face(which)[0] if self._edge is None else self._along(self._on_side(which)[0])
+        on_t = np.sum(self.rule(which).heights * on, axis=-1).reshape(len(self._copies.up), -1, len(X))
+        self._shape.back_of_thickness(self._modelled, X, np.einsum("c,cnm->nm", self._copies.up, on_t), into)
 
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
@@ -230,8 +239,9 @@ class Charged:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
 
-    def by_remanence(self, nodes: Array, rates: Array, own: range, weights: Weights) -> Array:
-        """Derivatives (cells, nodes, 3) by the remanence of a part of the energy and of its rate along `rates`.
+    def by_fields(self, nodes: Array, rates: Array, own: range, weights: Weights, *, of_shape: bool = False) -> Nodal:
+        """Derivatives of a part of the energy and of its rate along `rates` by the remanence and, if `of_shape`,
+        by the undeformed place and the thickness, where the deformed nodes stay.
 
         The energy is that of `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
 
@@ -241,10 +251,13 @@ class Charged:
             See `rules`.
         """
         rules, moved = self.rules(nodes, own), nodes + STEP * 1j * rates
-        into = Nodal(np.zeros_like(self._shape.r0), np.zeros_like(self._shape.remanence))
+        into = self._shape.nothing(of_shape=of_shape)
         far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
-        for kind, on_q in zip(self._kinds, far.by_charges(nodes, moved, cells_far, weights), strict=True):
+        found = far.by_charges(nodes, moved, cells_far, weights)
+        for kind, on_q, on_heights in zip(self._kinds, *found, strict=True):
             kind.back(FAR, on_q, into)
+            if of_shape:
+                kind.back_of_heights(FAR, on_heights, into)
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own.start
         for number in map(int, np.unique(which)):
@@ -254,9 +267,11 @@ class Charged:
                 charged = (one_row >= 0) & (other_row >= 0)
                 left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
                 one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
+                if of_shape:
+                    one.back_of_heights(number, add_heights(moved, cells[charged], left, right, weights)[0], into)
         if self._near:
-            self._near.by_remanence(moved, weights, into)
-        return into.by_remanence
+            self._near.by_fields(moved, weights, into)
+        return into
 
 
 def _balls(nodes: Array) -> tuple[Array, Array]:

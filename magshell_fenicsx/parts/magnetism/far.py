@@ -9,12 +9,14 @@ D = dM/du^T G dM/du + L . d2M/du2. Moments go up to larger boxes and L comes dow
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
-from magshell_fenicsx.parts.magnetism.by_charges import STEP, Complex, Weights, places
+from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
+from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
@@ -110,8 +112,10 @@ class Far:
 
     def by_charges(
         self, nodes: Array, moved: Complex, kinds: Sequence[tuple[Ints, Points]], weights: Weights
-    ) -> list[Array]:
-        """Derivatives of the energy of all, and of its rate, by the charges of own cells, like `Points.q` of each kind.
+    ) -> tuple[list[Array], list[Array]]:
+        """Derivatives of the energy of all, and of its rate, like `Points.q` of each kind, of own cells.
+
+        Those by the charges, and those by their heights over the mid-surface.
 
         Parameters
         ----------
@@ -119,18 +123,30 @@ class Far:
             (cells, k, 3) the nodes, with rates times `STEP` as imaginary parts.
         """
         Y, N, width = self.placed(nodes).Y, derivatives(), self._leaf.width
-        x = [places(points, np.arange(len(points.q)), moved[cells])[2].reshape(-1, 3) for cells, points in kinds]
-        rate = np.concatenate(x)[self._order].imag / STEP / width
-        dY = rate[:, 0] * (N[0] @ Y) + rate[:, 1] * (N[1] @ Y) + rate[:, 2] * (N[2] @ Y)
+        at = [places(points, np.arange(len(points.q)), moved[cells]) for cells, points in kinds]
+        normals = [np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3) for _, n, x in at]
+        rate = np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag / STEP / width
+        upwards = np.concatenate(normals)[self._order] / width
+        n, dn = upwards.real, upwards.imag / STEP
+
+        def along(v: NDArray[np.floating[Any]], Y: Array) -> Array:
+            return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
+
+        dY, nY = along(rate, Y), along(n, Y)
+        dnY = np.asarray(along(rate, nY) + along(dn, Y))
         L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
-        by_q = np.empty(len(self._q))
+        by = np.empty((2, len(self._q)))
         for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
-            y, dy = Y[:, first:end], dY[:, first:end]
-            at = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
-            by_q[self._order[first:end]] = at / width
-        parts = np.split(by_q, np.cumsum([points.q.size for _, points in kinds])[:-1])
-        shaped = [part.reshape(points.q.shape) for part, (_, points) in zip(parts, kinds, strict=True)]
-        return [part * own[:, None, None] for part, own in zip(shaped, self._own, strict=True)]
+            for i, (y, dy) in enumerate(((Y, dY), (nY, dnY))):
+                y, dy = y[:, first:end], dy[:, first:end]
+                of = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
+                by[i, self._order[first:end]] = (self._q[first:end] if i else 1.0) * of / width
+        split = np.cumsum([points.q.size for _, points in kinds])[:-1]
+        each = zip(*(np.split(values, split) for values in by), kinds, self._own, strict=True)
+        parts = [
+            [part.reshape(points.q.shape) * own[:, None, None] for part in both] for *both, (_, points), own in each
+        ]
+        return [part[0] for part in parts], [part[1] for part in parts]
 
     def _summed(self, values: Array) -> Array:
         """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of boxes."""

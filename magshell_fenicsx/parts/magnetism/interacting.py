@@ -188,20 +188,39 @@ class InteractionTerm:
             self._stiff = nodes, self._acting_at(nodes)
         return self._stiff[1]
 
-    def by_field(self, direction: fem.Function, energy: float, force: float) -> tuple[fem.Function, Array]:
-        """The remanence, and the derivatives by it; see `assembly.coupled.KnowsFields`; collective."""
-        own = own_field(self._sight)
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Of remanence, thickness and placement; see `assembly.coupled.KnowsFields`; collective."""
+        own, of_shape = own_field(self._sight), name in ("thickness", "r0")
         nodes, rates = self._nodes(), whole(direction)[self._cells.nodes]
-        turned = [rates @ image.Q.T for image in self._copies.images]
+        turned = np.concatenate([rates @ image.Q.T for image in self._copies.images])
+        weights, own_cells = Weights(self._scale * energy, self._scale * force), self._cells.own
+        part = slice(own_cells.start, own_cells.stop)
+        if of_shape:
+            into = self._charged.by_fields(nodes, turned, own_cells, weights, of_shape=True)
+            by_place, by_thickness = (self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness))
+            if name == "thickness":
+                assert self._model.thickness
+                return self._model.thickness, np.asarray(by_thickness[..., None])
+            return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
+        if name != own.Br.name:
+            return None
         shape, cells, edges = self._all(may=True)
         near = Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies, may=True)
         charged = Charged(
             shape, self._parts, cells, edges, self._comm, near if self._itself else None, self._copies, may=True
         )
-        weights = Weights(self._scale * energy, self._scale * force)
-        found = charged.by_remanence(nodes, np.concatenate(turned), self._cells.own, weights)
-        own_cells = slice(self._cells.own.start, self._cells.own.stop)
-        return own.Br, np.asarray(self._comm.allreduce(found))[own_cells]
+        found = charged.by_fields(nodes, turned, own_cells, weights).by_remanence
+        return own.Br, np.asarray(self._comm.allreduce(found))[part]
+
+    def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
+        """By the nodes of own cells: a placement moves charges as a displacement does; collective."""
+        V, count = self._u.function_space, len(self._cells.own)
+        of_nodes = energy * self._evaluated()[1] + force * _product(self.acting(), whole(direction).ravel())
+        nodes = V.dofmap.list[:count]
+        shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
+        return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
 
     def _acting_at(self, nodes: Array) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
         own, images, V = self._cells.own, self._copies.images, self._u.function_space
@@ -247,10 +266,13 @@ class InteractionTerm:
         return self._seen[1:]
 
     def _nodes(self) -> Array:
-        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if shape or remanence changed."""
+        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes them changed."""
         r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
-        given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
+        factor, of_nodes = self._model.thickness, own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list]
+        given: tuple[Array, ...] = (r0, self._cells.gathered(of_nodes))
+        if factor is not None:
+            given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen()
             for name in ("_charged", "_near"):
@@ -273,7 +295,7 @@ class InteractionTerm:
         """The cells of all ranks, and their edges that are charged, or `may` be by any remanence; collective."""
         own = own_field(self._sight)
         shape, (cells, edges) = own.shape({}), own.chargeable if may else own.edges
-        thick = shape.thick and (shape.thick[0], self._cells.gathered(shape.thick[1]))
+        thick = shape.thick and (shape.thick[0], self._given[2])
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
         everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
         own_cells, every = np.asarray(cells) + self._cells.own.start, self._comm

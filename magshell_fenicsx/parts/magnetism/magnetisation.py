@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, stren
 from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
-from magshell_fenicsx.parts.magnetism.sensors import sensors, units
+from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
 from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
@@ -103,6 +103,7 @@ def magnetisation(
         soft(context, turn, within),
         own if np.isfinite(own) else 1.0,
         context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
+        magnetic.lambda_m == 0 and not is_read(context),
     )
 
 

@@ -58,6 +58,8 @@ class Magnetisation:
         What a remanence of length one is, in T; 1 if the case has no flux densities.
     metres
         R in m; 0 if the case has no lengths with units, or no flux densities.
+    absent
+        Whether the case says that nothing is magnetised, though it has a direction: lambda_m is 0, and nothing reads.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -76,6 +78,7 @@ class Magnetisation:
     soft: Soft | None = None
     tesla: float = 1.0
     metres: float = 0.0
+    absent: bool = False
 
     @property
     def uniform(self) -> bool:

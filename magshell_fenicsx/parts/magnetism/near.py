@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add
+from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add, add_heights
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Found, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
@@ -311,14 +311,16 @@ class Near:
                 sides = Sides(self._shape, cells, np.full(len(cells), edge))
                 yield edge, cells, sides.at(Boxes.whole(len(cells)), at, np.ones(len(at)), into)
 
-    def by_remanence(self, moved: Complex, weights: Weights, into: Nodal) -> None:
-        """Add the derivatives by the remanence: see `Charged.by_remanence`."""
+    def by_fields(self, moved: Complex, weights: Weights, into: Nodal) -> None:
+        """Add the derivatives that `into` has: see `Charged.by_fields`."""
         on_faces, on_strips = np.zeros_like(self._on_faces), [np.zeros_like(each) for each in self._on_strips]
         for batch in self._batches:
             pairs = batch.pairs[: batch.own]
             rows = np.arange(len(pairs))
             sides = zip((0, 1), (batch.of_left, batch.of_right), strict=True)
             on_q = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights)
+            if into.by_thickness is not None:
+                self._by_heights(batch, pairs, moved, weights, into)
             for i, (points, edge, share) in sides:
                 copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
                 on = on_q[i][: len(pairs)].reshape(len(pairs), len(points.weights), -1)
@@ -333,6 +335,16 @@ class Near:
         for edge, cells, found in self._found_on_strips(into):
             assert found.back
             found.back(np.zeros_like(found.x), on_strips[edge][cells][..., None])
+
+    def _by_heights(self, batch: Batch, pairs: Ints, moved: Complex, weights: Weights, into: Nodal) -> None:
+        rows, both = np.arange(len(pairs)), (batch.left, batch.right)
+        on = add_heights(moved, pairs, (batch.left, rows), (batch.right, rows), weights)
+        for i, (places, _, _) in enumerate((batch.of_left, batch.of_right)):
+            copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
+            shape = len(pairs), len(places.weights), -1
+            heights = both[i].heights.reshape(shape[1:])
+            on_t = self._copies.up[copy][:, None] * np.sum(heights * on[i][: len(pairs)].reshape(shape), axis=-1)
+            self._shape.back_of_thickness(cells, places.X, on_t, into)
 
 
 def _basis(points: Places) -> Array:

@@ -1,21 +1,20 @@
 """The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-import basix
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.hexahedra import WHOLE
 from magshell_fenicsx.mesh.mirror import Image, rotation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape, unit
+from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, field, gradient, moment, triangles
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
@@ -34,7 +33,7 @@ def magnetised(loads: Loads) -> Magnetisation | None:
 
 
 class OwnField:
-    """The charges of a model's shell.
+    """The charges of a model's shell; those of a solid are of `own_field_of_body`.
 
     Parameters
     ----------
@@ -57,20 +56,28 @@ class OwnField:
         topology = V.mesh.topology
         self._dim = topology.dim
         self._owned = topology.index_map(self._dim).size_local
-        pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
-        self.Br = pattern_field(pattern, sight.model.r0)[0]
-        self._thickness = sight.model.thickness
-        thins = sight.model.law_of_cells.thins
-        self._thins = thins[: self._owned] if np.ndim(thins) else thins
+        self._pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
+        self.Br = self._given()
         self._plain = of.law == "deformation" and of.soft is None
         if not self._plain:
-            carrier = sight.model.carrier  # type: ignore[attr-defined]  # of thin models alone
-            self._at = carrier.discontinuous(3).element.basix_element
+            self._at = self._element()
         self.edges = self._sides()
-        self._sign = self._parity(pattern)
+        self._sign = self._parity()
 
-    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Shape, list[Family]]:
-        """The shell's shape and its charges at the displacement that the system has; `may`: of any other remanence."""
+    def _given(self) -> fem.Function:
+        """The remanence at nodes."""
+        return pattern_field(self._pattern, self._model.r0)[0]
+
+    def _places(self) -> tuple[Array, Array]:
+        """Places and normals at the nodes of cells."""
+        return places(self._model.r0)
+
+    def _element(self) -> Any:
+        """That in which what is not plain is interpolated."""
+        return self._model.carrier.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
+
+    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Any, list[Family]]:
+        """The shape and its charges at the displacement that the system has; `may`: of any other remanence."""
         shape = self.shape(mu)
         cells, edges = self.chargeable if may else self.edges
         faces = Faces(shape, np.arange(self._owned), may=may)
@@ -83,14 +90,23 @@ class OwnField:
 
     def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
         """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell; collective."""
-        total, faces = np.zeros_like(places), [family for family in families if isinstance(family, Faces)]
+        total = np.zeros_like(places)
         for image in self._images:
             seen_from, sign = image.back(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
-            held = np.logical_or.reduce([family.holds(seen_from) for family in faces])
-            total[held] = np.nan
+            total[self._holds(families, seen_from)] = np.nan
             out = ~np.isnan(total[:, 0])
             total[out] += sign * field(families, seen_from[out]) @ image.Q.T
         return np.asarray(self._model.system.comm.allreduce(total))
+
+    def _holds(self, families: Sequence[Family], places: Array) -> NDArray[np.bool_]:
+        """Which of places (n, 3) are in what is modelled on this rank."""
+        faces = families[0]
+        assert isinstance(faces, Faces)
+        return faces.holds(places)
+
+    def flat(self, families: Sequence[Family]) -> Sequence[Family]:
+        """The same charges on surfaces."""
+        return families
 
     def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
         """The derivatives of e . B at this rank's nodes, by the displacement and by the remanence."""
@@ -105,12 +121,16 @@ class OwnField:
         into = Nodal(parts[0].by_u, parts[-1].by_remanence)
         return into if self._plain else self._to_material(into, mu)
 
-    def moment(self, families: Sequence[Family], mu: Mapping[str, float]) -> Array:
-        """The integral of the remanence as the shell carries it over its volume, (3,) over R³; collective."""
-        total = np.asarray(self._model.system.comm.allreduce(moment(families)))
+    def moment(self, mu: Mapping[str, float]) -> Array:
+        """The integral of what is magnetised over the volume, remanent and induced, (3,) over R³; collective."""
+        total = np.asarray(self._model.system.comm.allreduce(self._moment(mu)))
         if mirror := self._sight.mirror:
             total = mirror.summed(total, self.sign_of_images(mu))
         return total
+
+    def _moment(self, mu: Mapping[str, float]) -> Array:
+        """Of this rank's part of what is modelled."""
+        return moment(self.families(mu)[1])
 
     @property
     def _images(self) -> list[Image]:
@@ -118,15 +138,15 @@ class OwnField:
         mirror = self._sight.mirror
         return mirror.images if mirror else [Image(np.eye(3), np.zeros(3), 1.0)]
 
-    def shape(self, mu: Mapping[str, float]) -> Shape:
+    def shape(self, mu: Mapping[str, float]) -> Any:
         """Its shape and remanence at the displacement that the system has."""
         model, V = self._model, self._model.r0.function_space
         element, nodes, size = V.element.basix_element, V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (f.x.array.reshape(-1, size)[nodes] for f in (model.r0, model.system.u))
-        thick = None
-        if self._thickness is not None:
-            T = self._thickness.function_space
-            thick = T.element.basix_element, self._thickness.x.array[T.dofmap.list[: self._owned]]
+        thick, factor = None, model.thickness
+        if factor is not None:
+            T = factor.function_space
+            thick = T.element.basix_element, factor.x.array[T.dofmap.list[: self._owned]]
         if self._plain:
             Q = self.Br.function_space
             of, B = Q.element.basix_element, self._nodal()
@@ -134,17 +154,23 @@ class OwnField:
         Beff = self._material(self._jets(r0), self._jets(u), mu)
         return Shape(element, r0, u, self._at, Beff, model.material.h, thick, size == 2, self._thins)
 
+    @property
+    def _thins(self) -> Array | float:
+        """Of this rank's cells, see `Shape.thins`."""
+        thins = self._model.law_of_cells.thins
+        return np.asarray(thins)[: self._owned] if np.ndim(thins) else thins
+
     def _nodal(self, cells: int | None = None) -> Array:
         """The remanence at the nodes of cells."""
         Q = self.Br.function_space
         return np.asarray(self.Br.x.array.reshape(-1, 3)[Q.dofmap.list[: self._owned if cells is None else cells]])
 
     def _jets(self, nodal: Array) -> Array:
-        """(3, cells, nodes, 3) of a field at the nodes of what is taken back to the undeformed shell."""
+        """(derivatives, cells, nodes, 3) of a field at the nodes of what is taken back to the undeformed shell."""
         V = self._model.r0.function_space
         T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
         jets = np.einsum("dmk,nki->dnmi", T, nodal)
-        if self._dim == 2:
+        if self._dim > 1:
             return np.asarray(jets)
         zero = np.zeros(jets.shape[1:3])
         parts = [(f[..., 0], zero, f[..., 1]) for f in jets] + [(zero, jets[0][..., 0], zero)]
@@ -178,7 +204,7 @@ class OwnField:
         nodes, size = V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (self._jets(f.x.array.reshape(-1, size)[nodes]) for f in (model.r0, model.system.u))
         on = np.zeros_like(u)
-        for d in range(3):
+        for d in range(len(u)):
             for i in range(3):
                 for way, weight in CENTRAL:
                     moved = u.copy()
@@ -256,55 +282,22 @@ class OwnField:
             return self._sight.loads.magnetic.sign_of_images(shown, self._sight.model.r0, self._sight.mirror)
         return sign
 
-    def _parity(self, pattern: Callable[[Array, Array], Array]) -> float:
-        x, n = (each[: self._owned] for each in places(self._model.r0))
-        return _parity(pattern, x, n, self._sight)
-
-
-def _parity(pattern: Callable[[Array, Array], Array], x: Array, n: Array, sight: Sight) -> float:
-    """1 if the mirror images of a remanence continue it, -1 if their opposites do; collective."""
-    if sight.mirror is None:
-        return 1.0
-    S = sight.mirror.reflection
-    images = pattern(sight.mirror.image(x), n @ S) @ S
-    return float(np.sign(sight.model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
+    def _parity(self) -> float:
+        """1 if the mirror images of the remanence continue it, -1 if their opposites do; collective."""
+        if self._sight.mirror is None:
+            return 1.0
+        x, n = (each[: self._owned] for each in self._places())
+        S, pattern = self._sight.mirror.reflection, self._pattern
+        images = pattern(self._sight.mirror.image(x), n @ S) @ S
+        return float(np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
 
 
 def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
-    """The integral of the remanence and of what a field induces, as the shell carries them, (3,) over R³; collective.
+    """The integral of the remanence and of what a field induces, as they are carried, (3,) over R³; collective.
 
     In the frame of the model, at the displacement that its system has.
     """
-    if sight.model.r0.function_space.mesh.topology.dim < 3:
-        own = own_field(sight)
-        return own.moment(own.families(mu)[1], mu)
-    return _moment_of_body(sight, mu)
-
-
-def _moment_of_body(sight: Sight, mu: Mapping[str, float]) -> Array:
-    """The same of a solid, whose polarisation per undeformed volume is F Br or R Br, and what is induced."""
-    model, of, V = sight.model, magnetised(sight.loads), sight.model.r0.function_space
-    assert of
-    points, weights = basix.make_quadrature(V.mesh.basix_cell(), WHOLE)
-    T, owned = V.element.basix_element.tabulate(1, points)[..., 0], V.mesh.topology.index_map(3).size_local
-    X, u = (np.einsum("dqk,cki->dcqi", T, f.x.array.reshape(-1, 3)[V.dofmap.list]) for f in (model.r0, model.system.u))
-    G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
-    F, n0 = np.eye(3) + H @ np.linalg.inv(G), unit(np.cross(X[1], X[2]))
-    pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
-    J, sign = np.zeros_like(n0), 0.0
-    if not (of.soft and of.soft.alone):
-        U, _, W = np.linalg.svd(F)
-        J = np.einsum("cqij,cqj->cqi", F if of.law == "deformation" else U @ W, pattern(X[0], n0))
-        sign = _parity(pattern, X[0], n0, sight)
-    if of.soft:
-        n = unit(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None])[..., 0])
-        J = J + of.soft.scale**2 * of.soft.polarisation(X[0], n0, n, of.at(mu, X[0] + u[0]))
-    volume = np.abs(np.linalg.det(G)) * weights
-    total = np.asarray(model.system.comm.allreduce(np.einsum("cq,cqi->i", volume[:owned], J[:owned])))
-    if sight.mirror is None:
-        return total
-    shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
-    return sight.mirror.summed(total, sign or of.sign_of_images(shown, model.r0, sight.mirror))
+    return own_field(sight).moment(mu)
 
 
 def own_field(sight: Sight) -> OwnField:
@@ -312,12 +305,18 @@ def own_field(sight: Sight) -> OwnField:
     model, of = sight.model, magnetised(sight.loads)
     own = model.kept.get(OwnField)
     if own is None or own.magnetised is not of:
-        own = model.kept[OwnField] = OwnField(sight)
+        if sight.model.r0.function_space.mesh.topology.dim == 3:
+            from magshell_fenicsx.parts.magnetism.own_field_of_body import OwnFieldOfBody  # it is an own field
+
+            own = OwnFieldOfBody(sight)
+        else:
+            own = OwnField(sight)
+        model.kept[OwnField] = own
     return own
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
-    """The shell of a state as a source of magpylib, of charged triangles, in m and T; without units over R and |Br|.
+    """The body of a state as a source of magpylib, of charged triangles, in m and T; without units over R and |Br|.
 
     Parameters
     ----------
@@ -332,14 +331,14 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
     from magshell_fenicsx.parts.magnetism.sources.source import magpylib
 
     of = magnetised(sight.loads)
-    if of is None or not hasattr(sight.model, "carrier"):
+    if of is None:
         raise CaseError("to_magpylib: of a shell with a remanence or a susceptibility, this has neither")
     made, own, mirror = magpylib("to_magpylib"), own_field(sight), sight.mirror
     Q, R = rotation(sight.azimuth), of.metres or 1.0
 
     def present() -> list[tuple[Array, Array]]:
         _, families = own.families(state.mu)
-        all_charged = [each for family in families for each in triangles(family, parts)]
+        all_charged = [each for family in own.flat(families) for each in triangles(family, parts)]
         if mirror:
             sign = own.sign_of_images(state.mu)
             copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]

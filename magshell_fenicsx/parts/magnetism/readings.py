@@ -57,7 +57,7 @@ class FieldSeen(Seen):
         from magshell_fenicsx.parts.magnetism.own_field import magnetic_moment, magnetised
 
         of = magnetised(sight.loads)
-        if of is None:
+        if of is None or of.absent:
             return {}
         at = sight.model.system.at(state)
         moment = at.of(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)

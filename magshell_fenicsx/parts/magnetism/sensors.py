@@ -123,7 +123,7 @@ def refuse_unfit_reading(key: str, context: Context) -> None:
     """
     if context.of(MagneticSection) is None:
         raise ValueError(f"{key}: need magnetic: nothing is magnetised, and no field applied")
-    context.needs(key, "the whole shell", "a mid-surface")
+    context.needs(key, "the whole shell")
     if "a thickness that does not change" in context.withdrawn:  # it follows from the area
         context.needs(key, "the area as drawn")
 

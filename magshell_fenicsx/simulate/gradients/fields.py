@@ -42,7 +42,6 @@ if TYPE_CHECKING:  # one of them is built
 
 Array = NDArray[np.float64]
 Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
-OF_CHARGES = ("thickness", "deviation")  # of what acts on other parts
 MASS = "mass"
 
 
@@ -78,11 +77,6 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
         raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
-    if scene.problem.loads.interaction and name in OF_CHARGES:
-        raise CaseError(
-            f"{name}: beside magnetic.interaction no result has a gradient by this field; allowed are remanence, "
-            "magnitude"
-        )
     knowing = [term for term in model.system.terms if isinstance(term, KnowsFields)]
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
@@ -92,7 +86,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
         w = _contracted(scene, place)
-        known = [_known(term, place, w) for term in knowing] if kind.coefficient == "Br" else []
+        known = [of for term in knowing if (of := _known(term, place, w, kind.coefficient))]
         f = f or next((of for of, _ in known), None)
         if f is None and slope and slope.field is not None and kind.coefficient == slope.field.name:
             f = slope.field
@@ -124,10 +118,10 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     return FieldGradient(f, forces, places, normals)
 
 
-def _known(term: KnowsFields, place: Place, w: fem.Function) -> tuple[fem.Function, Array]:
+def _known(term: KnowsFields, place: Place, w: fem.Function, name: str) -> tuple[fem.Function, Array] | None:
     """What a term gives that knows its derivatives by a field itself."""
     mu = factor_of(term.amplitude, place.state.mu)
-    return term.by_field(w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu)
+    return term.by_field(name, w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu)
 
 
 def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:

@@ -16,7 +16,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.grids import grid_content, read_map
 from magshell_fenicsx.output.fields.vtu import FieldSeries
-from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, plane_of, section
+from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, outlines, plane_of, section
 from magshell_fenicsx.output.pictures.plot import Drawn, plot
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Grid
@@ -110,10 +110,25 @@ def test_a_file_gives_back_its_grid(tmp_path: Path) -> None:
         read_map(tmp_path / "g.vtu")
 
 
+def test_the_section_of_a_solid() -> None:
+    """Two squares, of which each side is two lines in any order, are two polygons."""
+    square = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1.0]])
+    lines = np.stack([square, np.roll(square, -1, axis=0)], axis=1)
+    lines[::3] = lines[::3, ::-1]
+    both = np.random.default_rng(1).permutation(np.concatenate([lines, 3 + 1.5 * lines, [[[1, 0], [1, 1e-12]]]]))
+    areas = []
+    for polygon in outlines(both):
+        x, y = polygon.T
+        areas.append(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
+    np.testing.assert_allclose(sorted(areas), [4.0, 9.0])
+
+
 @pytest.mark.slow
-def test_ranks_and_resume(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sections", [{}, {"model": "solid", "mesh": {"refinement": 0.4}}], ids=["shell", "solid"])
+def test_ranks_and_resume(tmp_path: Path, sections: dict[str, Any]) -> None:
     """The same map on 1, 2 and 3 ranks, of which one goes on from its first point."""
-    (tmp_path / "case.yaml").write_text(yaml.safe_dump(case(TILTED, "half", field_maps={"box": BOX})))
+    given = case(TILTED, "half", field_maps={"box": BOX, "across": ACROSS}) | sections
+    (tmp_path / "case.yaml").write_text(yaml.safe_dump(given))
     fields = []
     for name, more, ranks in [("1", ("--time-limit", 0), 1), ("2", (), 2), ("3", (), 3)]:
         done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / name, *more, ranks=ranks)
@@ -143,7 +158,6 @@ def test_what_check_says() -> None:
         ({"sides": [[1, 0, 0], [1, 1, 0], [0, 0, 1]]}, {}, r"field_maps\.box: sides: are not perpendicular"),
         ({"corner": [0, 0]}, {}, r"field_maps\.box\.corner"),
         ({}, {"magnetic": None}, "field_maps: need magnetic"),
-        ({}, {"model": "solid"}, "field_maps: needs a mid-surface"),
         ({"field": "none"}, {}, r"field_maps\.box\.field"),
         ({}, {"field_maps": {"../box": BOX}}, "field_maps: ../box: a name is made of"),
         ({}, {"magnetic": {"lambda_m": 1e-3}}, "field_maps.box.field: total: lambda_m does not say"),

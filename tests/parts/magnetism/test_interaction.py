@@ -1,5 +1,6 @@
 """Magnetised parts in each other's field: magpylib's closed forms, differences, and an elastica."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism import interacting
+from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.gradients.gradient import gradient as gradient_of
@@ -394,6 +397,60 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
     assert slope == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("interaction", "symmetry"),
+    [
+        ("others", "half"),
+        pytest.param("others", "none", marks=pytest.mark.slow),
+        pytest.param("all", "half", marks=pytest.mark.slow),
+    ],
+)
+def test_derivatives_by_thickness_and_place(
+    model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interaction: str, symmetry: str
+) -> None:
+    """Of the energy and of forces along a displacement: differences of fourth order, 1e-7; cells and rules stay."""
+    strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, 1.5)
+    remanent = {"kind": "expression", "components": ["1 + x/9", "0", "0.2"], "flux_density": f"{BR} T"}
+    case = case_of(
+        tmp_path / "strips.msh",
+        0.2,
+        magnetic={"interaction": interaction, "remanent": remanent},
+        mesh={"degree": 2},
+        symmetry=symmetry,
+    )
+    scene = Scene(replace(case.problem(), thickness=Thickness()))
+    term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
+    r0, thickness, u, v = scene.model.r0, scene.model.thickness, scene.model.u, fem.Function(scene.model.V)
+    assert thickness
+    X, rng = r0.x.array.reshape(-1, 3).copy(), np.random.default_rng(0)
+
+    def smooth(k: float) -> np.ndarray:
+        x, y = k * X[:, 0], X[:, 1] ** 2
+        return np.stack([np.sin(2 * x + y), X[:, 1] * np.cos(x), np.sin(3 * x + y)], axis=-1).ravel()
+
+    u.x.array[:], v.x.array[:], r0.x.array[:] = 1e-2 * smooth(1.5), smooth(0.7), r0.x.array + 1e-2 * smooth(1.0)
+    thickness.x.array[:] += 0.1 * rng.standard_normal(len(thickness.x.array))
+    fixed = property(lambda self: 0.07, lambda self, value: None)
+    monkeypatch.setattr(Near, "_scale", fixed, raising=False)  # else rules change with the size of cells
+
+    def values() -> np.ndarray:
+        b = np.zeros(len(u.x.array))
+        term.add_residual(b, 1.0)
+        return np.array([term.energy(), b @ v.x.array])
+
+    for f, change in ((thickness, rng.standard_normal(len(thickness.x.array))), (r0, smooth(1.2))):
+        before, width = f.x.array.copy(), f.function_space.dofmap.bs
+        along = change.reshape(-1, width)[f.function_space.dofmap.list]
+        both = [term.by_field(f.name, v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0))]
+        found = [np.sum(of[1] * along) for of in both if of]
+        expected = np.zeros(2)
+        for way, weight in ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12)):
+            f.x.array[:] = before + way * 1e-4 * change
+            expected += weight / 1e-4 * values()
+        f.x.array[:] = before
+        np.testing.assert_allclose(found, expected, rtol=1e-7)
+
+
 @pytest.mark.parametrize("interaction", ["others", pytest.param("all", marks=pytest.mark.slow)])
 def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: str) -> None:
     """Of the energy and of forces along a displacement: differences of both, exact as they are quadratic; 1e-9."""
@@ -405,7 +462,7 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
     term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
     rng, u, v = np.random.default_rng(0), scene.model.u, fem.Function(scene.model.V)
     u.x.array[:], v.x.array[:] = (size * rng.standard_normal(len(u.x.array)) for size in (1e-3, 1.0))
-    (Br, by_energy), (_, by_force) = term.by_field(v, 1.0, 0.0), term.by_field(v, 0.0, 1.0)
+    (Br, by_energy), (_, by_force) = (term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
     change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
     own, forces, energies = own_field(term._sight), list[float](), list[float]()
     own.edges = own.chargeable  # the change has charges on edges between cells
@@ -417,6 +474,34 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
     along = change.reshape(-1, 3)[Br.function_space.dofmap.list]
     assert np.sum(by_energy * along) == pytest.approx((energies[0] - energies[1]) / 2, rel=1e-9)
     assert np.sum(by_force * along) == pytest.approx((forces[0] - forces[1]) / 2, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interaction", ["others", "all"])
+def test_gradients_by_thickness_and_shape_beside_a_neighbour(model: Any, tmp_path: Path, interaction: str) -> None:
+    """The deflection of a tip: differences of whole runs with other thickness and shape of both strips, 1e-6."""
+    rooted_strips(tmp_path / "strips.msh")
+
+    def ran(**keys: Any) -> Any:
+        shell = {"geometry": "mesh", "file": str(tmp_path / "strips.msh"), "unit": "mm", "radius": "5 mm"}
+        shell |= {"thickness": "0.2 mm", "youngs_modulus": "20 MPa", "poisson_ratio": 0, **keys}
+        magnetic = {"interaction": interaction, "remanent": {"polar": 30, "flux_density": f"{BR} T"}}
+        held, points = {"part0": "clamped", "root": "clamped"}, {"tip": ["4 mm", "1 mm", "1.5 mm"]}
+        sections = {"shell": shell, "boundary": held, "points": points, "magnetic": magnetic, "mesh": {"degree": 2}}
+        return run(case_of(tmp_path / "strips.msh", 0.2, **sections))
+
+    def slope(d: float, keys: Any) -> float:
+        tips = [ran(**keys(side * d)).rows[-1]["tip_uz_mm"] for side in (1, -1)]
+        return float(tips[0] - tips[1]) / (2 * d)
+
+    found = ran()
+    by = gradient_of(found.scene, found.latest, of="tip_uz_mm", by=["thickness", "deviation"])
+    x = by["thickness"].places[..., :1]
+    thicker = slope(1e-3, lambda e: {"thickness_factor": f"1 + {e!r}*x"})
+    assert by["thickness"].along(x) == pytest.approx(thicker, rel=1e-6)
+    x, y = by["deviation"].places[..., :1], by["deviation"].places[..., 1:2]
+    other = slope(5e-3, lambda e: {"imperfections": [{"kind": "formula", "w0": "x**2 + 0.3*x*y", "amplitude": e}]})
+    assert by["deviation"].along(x**2 + 0.3 * x * y) * 0.2 / 5 == pytest.approx(other, rel=1e-6)
 
 
 @pytest.mark.slow

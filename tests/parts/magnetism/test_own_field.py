@@ -90,6 +90,7 @@ def test_the_case_hall_sensor() -> None:
 
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa"}
 STRIP = {"geometry": "strip", "radius": "30 mm", "width": 0.3, "thickness": "0.6 mm", "youngs_modulus": "1 MPa"}
+BLOCK = {**STRIP, "radius": "20 mm", "thickness": "2 mm"}
 SQUASHED = np.array([[1.2, 0.1, 0.0], [0.0, 0.9, 0.1], [0.1, 0.0, 0.6]])
 
 
@@ -236,6 +237,13 @@ KINDS = {
         {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5, "thickness_factor": "1 + z/4"},
         {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"}, "applied": {"flux_density": "30 mT"},
          "remanence": "rotation"}, {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "solid": lambda: made(BLOCK, {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
+                                                        "flux_density": "60 mT"}},
+                          {"hall": {"position": [12 * MM, 1 * MM, 4 * MM], "field": "total"}}, symmetry="none",
+                          model="solid", mesh={"refinement": 0.3}),
+    "half solid, rotation law, soft": lambda: made(BLOCK, {**FIELD, "susceptibility": "1 + x", "remanence": "rotation"},
+                                                   {"hall": {"position": [12 * MM, 1 * MM, 4 * MM]}}, symmetry="half",
+                                                   model="solid", mesh={"refinement": 0.3}, loading={"kind": "field"}),
 }  # fmt: skip
 
 
@@ -407,3 +415,26 @@ def test_moment_of_what_is_induced() -> None:
         volume = np.pi * 400 * MM**2 * 1 * MM
         np.testing.assert_allclose(m, [0, 0, 1e-3 * 2 / 3 * volume / (4e-7 * np.pi)], rtol=1e-4, atol=1e-9 * m[2])
         assert m[2] == pytest.approx(row["induced_z"] * volume / (4e-7 * np.pi), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("magnetic", "sections", "there"),
+    [
+        ({"lambda_m": 0.0}, {}, False),
+        ({"lambda_m": 0}, {"sensors": {"hall": {"position": [0, 0, 2]}}}, True),
+        ({"lambda_m": 1e-3}, {}, True),
+        ({"remanent": {"flux_density": "60 mT"}, "applied": {"flux_density": "0 T"}}, {}, True),
+        ({"susceptibility": 2, "lambda_m": 0}, {}, False),
+        (None, {}, False),
+    ],
+)
+def test_what_has_a_moment(magnetic: dict[str, Any] | None, sections: dict[str, Any], there: bool) -> None:
+    """With lambda_m: 0 a case says that nothing is magnetised, unless it asks for the field."""
+    sized = {"radius_to_thickness": 20}
+    if magnetic and "lambda_m" not in magnetic:
+        sized = {"radius": "20 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+    case = {"shell": {"geometry": "hemisphere", "poisson_ratio": 0.3, **sized}, "boundary": {"equator": "clamped"}}
+    case |= {"loading": {"kind": "pressure"}, **sections} | ({"magnetic": magnetic} if magnetic else {})
+    scene = Scene(Case.model_validate(case).problem())
+    said = [found for room in SEEN if (found := room.summary(scene.sight, scene.unloaded()))]
+    assert bool(said) == there
