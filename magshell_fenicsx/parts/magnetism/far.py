@@ -79,6 +79,7 @@ class Far:
         self._filled, self._first = np.unique(box[self._order], return_index=True)
         self._middle = self._leaf.middle[box[self._order]]
         self._q = np.concatenate([points.q.ravel() for _, points in kinds])[self._order]
+        self._octants = [list(_octants(level.keys)) for level in tree.levels]
 
     def placed(self, nodes: Array) -> Placed:
         """The charges on cells with nodes (cells, k, 3)."""
@@ -141,16 +142,16 @@ class Far:
     def onto(self, M: Array) -> Array:
         """L = G M times the width, of the boxes (boxes, COUNT, n) of the finest level."""
         levels, moments = self._tree.levels, [M]
-        for level, larger in zip(levels[:0:-1], levels[-2::-1], strict=True):
-            up = np.zeros((len(larger.keys), *M.shape[1:]))
-            for Z, boxes in _octants(level.keys):
+        for k, level in reversed(list(enumerate(levels))[1:]):
+            up = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
+            for Z, boxes in self._octants[k]:
                 up[level.parent[boxes]] += _times(Z, moments[0][boxes])
             moments.insert(0, up)
         L = np.zeros_like(moments[0])
         for k, (level, of_level) in enumerate(zip(levels, moments, strict=True)):
             if k:
                 down = np.empty_like(of_level)
-                for Z, boxes in _octants(level.keys):
+                for Z, boxes in self._octants[k]:
                     down[boxes] = _times(Z.T, L[level.parent[boxes]]) / 2  # over half the width
                 L = down
             self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
@@ -254,7 +255,7 @@ def _each(B: Array, v: Array) -> Array:
 
 
 def _times(Z: Array, M: Array) -> Array:
-    return np.asarray(np.tensordot(M, Z, axes=(1, 1)).swapaxes(1, 2), dtype=np.float64)
+    return (M[..., 0] @ Z.T)[..., None] if M.shape[-1] == 1 else np.asarray(Z @ M)
 
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:

@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
+from magshell_fenicsx.assembly.whole import Blocks
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.by_charges import Weights
 from magshell_fenicsx.parts.magnetism.charged import Shape
@@ -43,7 +44,8 @@ class Foreseen:
     of the newest first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, blocks: Blocks) -> None:
+        self._blocks = blocks
         self._known = list[tuple[Array, Array]]()  # u of all nodes and this rank's part of the forces, the newest last
         self._of: ActingOnEachOther | None = None
         self._products = dict[int, Array]()  # D s, by the number of the later state
@@ -60,7 +62,7 @@ class Foreseen:
             return None
         before, forces = self._known[-1]
         s = u - before
-        foreseen = forces + _product(D, s)
+        foreseen = forces + self._product(D, s)
         for q, y in self._changes(D):
             foreseen += (q @ s) * y
         return foreseen
@@ -76,7 +78,7 @@ class Foreseen:
             for number, ((u, forces), (u0, forces0)) in zip(count(newest, -1), pairs):
                 s = u - u0
                 if number not in self._products:
-                    self._products[number] = _product(D, s)
+                    self._products[number] = self._product(D, s)
                 y, size = forces - forces0 - self._products[number], float(np.linalg.norm(s))
                 for _ in range(2):
                     for q, of_q in self._basis:
@@ -87,9 +89,8 @@ class Foreseen:
                     self._basis.append((np.asarray(s / rest), np.asarray(y / rest)))
         return self._basis
 
-
-def _product(D: "ActingOnEachOther", v: Array) -> Array:
-    return np.asarray(D.stored @ v + D.times_others(v[:, None]).ravel())
+    def _product(self, D: "ActingOnEachOther", v: Array) -> Array:
+        return np.asarray(self._blocks.times(D.stored, v) + D.times_others(v[:, None]).ravel())
 
 
 class InteractionTerm:
@@ -121,7 +122,8 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
-        self._foreseen = Foreseen()
+        self._blocks = Blocks(self._comm)
+        self._foreseen = Foreseen(self._blocks)
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther]] | None = None  # and its deformed nodes
 
     def antisymmetric(self) -> "InteractionTerm":
@@ -252,7 +254,7 @@ class InteractionTerm:
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen()
+            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen(self._blocks)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])

@@ -28,7 +28,7 @@ FUNCTIONS = """
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
         int64_t, const double *, const double *, double *);
 """
-KINDS = {"float64": "double[]", "int64": "int64_t[]", "int32": "int32_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
+KINDS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")} | {np.dtype(float): "double[]"}
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ class Stiffness:
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
         number = np.where(beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1).astype(np.int32)
         self._count = int(np.count_nonzero(beside))
-        self._columns = np.nonzero(beside)[1]
-        self._starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))])
+        self._columns = np.nonzero(beside)[1].astype(np.int32)
+        self._starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))]).astype(np.int32)
         self._shape = 3 * beside.shape[0], 3 * beside.shape[1]
         of_images = [number + self._count] if len(turn) > 1 else []
         self.where = np.concatenate([number, *of_images], axis=1)
@@ -264,7 +264,7 @@ class Pairs:
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype.name], array)
+        return self._ffi.from_buffer(KINDS[array.dtype], array)
 
 
 def _filled(rows: Ints, idle: int) -> Ints:
