@@ -2,7 +2,6 @@
 
 from copy import copy
 from functools import cached_property
-from itertools import count, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +19,7 @@ from magshell_fenicsx.parts.magnetism.by_charges import Weights
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
+from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
@@ -31,66 +31,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-CHANGES = 4  # latest ones that are remembered
-OWN = 0.3  # of a change: what newer ones do not have, at least
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
-
-
-class Foreseen:
-    """Forces near a state at which they were computed, by an earlier second derivative D and latest changes.
-
-    Of the latest states s are the differences and y those of their forces: what y - D s are along s is added to D, that
-    of the newest first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
-    """
-
-    def __init__(self, blocks: Blocks) -> None:
-        self._blocks = blocks
-        self._known = list[tuple[Array, Array]]()  # u of all nodes and this rank's part of the forces, the newest last
-        self._of: ActingOnEachOther | None = None
-        self._products = dict[int, Array]()  # D s, by the number of the later state
-        self._count = 0
-        self._basis: list[tuple[Array, Array]] | None = None
-
-    def learn(self, u: Array, forces: Array) -> None:
-        """Forces at a state."""
-        self._known, self._basis, self._count = [*self._known[-CHANGES:], (u, forces)], None, self._count + 1
-
-    def at(self, u: Array, D: "ActingOnEachOther") -> Array | None:
-        """This rank's part of the forces; None if nothing is known."""
-        if not self._known:
-            return None
-        before, forces = self._known[-1]
-        s = u - before
-        foreseen = forces + self._product(D, s)
-        for q, y in self._changes(D):
-            foreseen += (q @ s) * y
-        return foreseen
-
-    def _changes(self, D: "ActingOnEachOther") -> list[tuple[Array, Array]]:
-        """Orthonormal changes of u, and what D lacks along them."""
-        if D is not self._of:
-            self._of, self._products, self._basis = D, {}, None
-        if self._basis is None:
-            self._basis, newest = [], self._count
-            pairs = list(pairwise(reversed(self._known)))
-            self._products = {k: v for k, v in self._products.items() if k > newest - len(pairs)}
-            for number, ((u, forces), (u0, forces0)) in zip(count(newest, -1), pairs):
-                s = u - u0
-                if number not in self._products:
-                    self._products[number] = self._product(D, s)
-                y, size = forces - forces0 - self._products[number], float(np.linalg.norm(s))
-                for _ in range(2):
-                    for q, of_q in self._basis:
-                        part = float(q @ s)
-                        s, y = s - part * q, y - part * of_q
-                rest = float(np.linalg.norm(s))
-                if rest > OWN * size:
-                    self._basis.append((np.asarray(s / rest), np.asarray(y / rest)))
-        return self._basis
-
-    def _product(self, D: "ActingOnEachOther", v: Array) -> Array:
-        return np.asarray(self._blocks.times(D.stored, v) + D.times_others(v[:, None]).ravel())
 
 
 class InteractionTerm:
