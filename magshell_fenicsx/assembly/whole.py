@@ -26,7 +26,10 @@ from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 COLUMNS = 128  # for which products are computed at once where all entries are needed
-FUNCTIONS = "void of_blocks(int64_t, const int32_t *, const int32_t *, const double *, const double *, double *);"
+FUNCTIONS = """
+    void of_doubles(int64_t, const int32_t *, const int32_t *, const double *, const double *, double *);
+    void of_floats(int64_t, const int32_t *, const int32_t *, const float *, const double *, double *);
+"""
 
 
 class Acting(Protocol):
@@ -63,12 +66,14 @@ class Blocks:
         self._ffi, self._lib = native(Path(__file__).with_name("whole.c"), FUNCTIONS, comm)
 
     def times(self, A: bsr_array, v: Array) -> Array:
-        """A v."""
+        """A v; the entries of A may be single ones."""
         product, p = np.empty(A.shape[0]), self._ffi.from_buffer
         starts, columns = (np.asarray(each, dtype=np.int32) for each in (A.indptr, A.indices))
         values, x = np.ascontiguousarray(A.data), np.tile(v.reshape(-1, 3), 3)
-        arrays = p("int32_t[]", starts), p("int32_t[]", columns), p("double[]", values), p("double[]", x)
-        self._lib.of_blocks(len(starts) - 1, *arrays, p("double[]", product))
+        single = values.dtype == np.float32
+        arrays = p("int32_t[]", starts), p("int32_t[]", columns), p("float[]" if single else "double[]", values)
+        of_these = self._lib.of_floats if single else self._lib.of_doubles
+        of_these(len(starts) - 1, *arrays, p("double[]", x), p("double[]", product))
         return product
 
 

@@ -157,6 +157,10 @@ class Far:
             self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
         return L
 
+    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array) -> NDArray[np.float32] | None:
+        """See `Pairs.turned`."""
+        return self._pairs.turned(near, sign, numbers, q)
+
     def between(self, moments: Array) -> tuple[Ints, Array]:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
@@ -193,8 +197,8 @@ class Cells:
         The cells of this rank.
     rows
         (own cells, k) local numbers.
-    local
-        Number of local nodes.
+    numbers
+        (local nodes,) global ones.
     turn
         (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
     """
@@ -202,7 +206,7 @@ class Cells:
     nodes: NDArray[np.intp]
     own: range
     rows: Ints
-    local: int
+    numbers: Ints
     turn: Array
 
     def of_copies(self, v: Array, sign: float) -> Array:
@@ -213,9 +217,9 @@ class Cells:
 
     def summed(self, f: Array) -> Array:
         """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
-        summed_up = np.zeros((self.local, 3, f.shape[-1]))
+        summed_up = np.zeros((len(self.numbers), 3, f.shape[-1]))
         np.add.at(summed_up, self.rows, f.reshape(*self.rows.shape, 3, -1))
-        return summed_up.reshape(3 * self.local, -1)
+        return summed_up.reshape(3 * len(self.numbers), -1)
 
 
 @dataclass(frozen=True)
@@ -241,6 +245,11 @@ class ActingOnEachOther:
     def stored(self) -> bsr_array:
         """See `assembly.whole.Acting`."""
         return self.near.matrix(self.sign)
+
+    def turned(self, q: Array) -> bsr_array | None:
+        """What is stored, in single precision, where nodes are turned by q (nodes, 4); None of several images."""
+        blocks = self.far.turned(self.near, self.sign, self.cells.numbers, q)
+        return None if blocks is None else bsr_array((blocks, self.near.columns, self.near.starts), self.near.shape)
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""

@@ -1,20 +1,23 @@
 """Forces of all charges on each other near states at which they were computed, along a path and beside it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import bsr_array
 
 from magshell_fenicsx.assembly.whole import Blocks
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 
 Array = NDArray[np.float64]
-POINTS, MOST = 4, 2  # of the path that are remembered, and coefficients of the polynomial along it
+POINTS, MOST = 3, 2  # of the path that are remembered, and coefficients of the polynomial along it
 CHANGES = 4  # beside the path that are remembered
 TOGETHER = 0.5  # states nearer to each other than this part of the way from the point before belong to one point
 OWN = 0.3  # of a change: what newer ones do not have, at least
 STRAIGHT = 0.5  # of a way: along the path, at least
+TURNED = 0.02  # angle by which a node has turned since D was turned: it is turned again
 APART = 0.1  # of the larger one of two places along the path: their distance, at least
 SLOPE = 0.05  # of a way: two states as near as this one to each other tell a slope
 
@@ -41,36 +44,54 @@ class Foreseen:
     lack (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
     """
 
-    def __init__(self, blocks: Blocks) -> None:
-        self._blocks = blocks
+    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array]) -> None:
+        self._blocks, self._turns = blocks, turns
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
         self._D: ActingOnEachOther | None = None
+        self._stored: bsr_array | None = None  # of D, turned to `_turned`
+        self._turned: Array | None = None
         self._last: tuple[Array, Array] | None = None  # the last u and D u
         self._model: tuple[Along, list[tuple[Array, Array]]] | None = None
 
     def learn(self, u: Array, forces: Array) -> None:
         """Forces at a state."""
         known = Known(u, forces, self._product(u) if self._D else np.zeros_like(forces))
-        way = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
-        if self._points and way <= TOGETHER * self._ways[-1]:
+        if self._points and not self._begins(u):
             self._points[-1] = [*self._points[-1][-CHANGES:], known]
         else:
-            self._points, self._ways = [*self._points[-POINTS:], [known]], [*self._ways[-POINTS:], way]
+            way = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
+            before = [point[-2:] for point in self._points[1 - POINTS :]]
+            self._points, self._ways = [*before, [known]], [*self._ways[1 - POINTS :], way]
         self._model = None
 
-    def at(self, u: Array, D: ActingOnEachOther) -> Array | None:
-        """This rank's part of the forces; None if nothing is known."""
+    def at(self, u: Array, D: ActingOnEachOther, of_D: Array) -> Array | None:
+        """This rank's part of the forces, from those of D at its state; None if nothing is known."""
         if not self._points:
             return None
-        if D is not self._D:
-            self._D, self._last, self._model = D, None, None
-            self._points = [[Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points]
+        if D is not self._D or self._begins(u):
+            self._turn(u, D, of_D)
         along, changes = self._model = self._model or self._made()
         foreseen, s = self._product(u) + along.rest(u), u - along.base.u
         for q, y in changes:
             foreseen += (q @ s) * y
         return foreseen
+
+    def _begins(self, u: Array) -> bool:
+        """Whether a state is not of the last point."""
+        return float(np.linalg.norm(u - self._points[-1][-1].u)) > TOGETHER * self._ways[-1]
+
+    def _turn(self, u: Array, D: ActingOnEachOther, of_D: Array) -> None:
+        """Take D as it is at another state, if nodes have turned enough."""
+        anew = D is not self._D or self._turned is None
+        if not anew and 2 * np.abs(self._turns(u, self._turned)[:, :3]).max() < TURNED:
+            return
+        turned = D.turned(self._turns(u, of_D))
+        if turned is None and not anew:
+            return
+        self._D, self._stored, self._turned = D, D.stored if turned is None else turned, u
+        self._last = self._model = None
+        self._points = [[Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points]
 
     def _made(self) -> tuple["Along", list[tuple[Array, Array]]]:
         """The polynomial along the path, and orthonormal changes with what is lacking along them."""
@@ -91,8 +112,9 @@ class Foreseen:
     def _product(self, u: Array) -> Array:
         if self._last is None or not np.array_equal(u, self._last[0]):
             assert self._D
+            assert self._stored is not None
             others = self._D.times_others(u[:, None]).ravel()
-            self._last = u, np.asarray(self._blocks.times(self._D.stored, u) + others)
+            self._last = u, np.asarray(self._blocks.times(self._stored, u) + others)
         return self._last[1]
 
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
 from magshell_fenicsx.assembly.whole import Blocks
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.by_charges import Weights
-from magshell_fenicsx.parts.magnetism.charged import Shape
+from magshell_fenicsx.parts.magnetism.charged import Shape, unit
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
@@ -33,6 +34,12 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
+
+
+def polar(F: Array) -> Array:
+    """The rotations nearest to matrices (n, 3, 3) with positive determinants."""
+    U, _, V = np.linalg.svd(F)
+    return np.asarray(U @ V)
 
 
 class InteractionTerm:
@@ -65,8 +72,8 @@ class InteractionTerm:
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
         self._blocks = Blocks(self._comm)
-        self._foreseen = Foreseen(self._blocks)
-        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther]] | None = None  # and its deformed nodes
+        self._foreseen = Foreseen(self._blocks, self._turns)
+        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = None  # beside its nodes and u
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""
@@ -111,7 +118,7 @@ class InteractionTerm:
     def add_foreseen(self, b: Array, factor: float) -> None:
         """See `assembly.whole.WholeTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
-        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0]) if self._stiff else None
+        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2]) if self._stiff else None
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
 
     def compile_tangent(self) -> None:
@@ -129,7 +136,7 @@ class InteractionTerm:
         nodes = self._nodes()
         if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
             self._stiff = None  # two are not kept at once
-            self._stiff = nodes, self._acting_at(nodes)
+            self._stiff = nodes, self._acting_at(nodes), whole(self._u).ravel()
         return self._stiff[1]
 
     def by_field(self, direction: fem.Function, energy: float, force: float) -> tuple[fem.Function, Array]:
@@ -166,7 +173,8 @@ class InteractionTerm:
             self._charged.evaluate(nodes, own, stiffness)
         except Touching:
             stiffness.blocks[:] = np.nan
-        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], local, turn)
+        numbers = V.dofmap.index_map.local_to_global(np.arange(local, dtype=np.int32))
+        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
             ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
@@ -196,10 +204,24 @@ class InteractionTerm:
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen(self._blocks)
+            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen(self._blocks, self._turns)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])
+
+    def _turns(self, u: Array, before: Array) -> Array:
+        """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar last."""
+        r0, nodes = whole(self._model.r0), self._cells.nodes
+        element = self._all()[0].element
+        T = element.tabulate(1, element.points)[1:, :, :, 0]
+
+        def frames(u: Array) -> Array:
+            a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
+            return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
+
+        F = np.zeros((len(r0), 3, 3))
+        np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(before)))
+        return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
     def _charged(self) -> Charged:
