@@ -16,18 +16,18 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
+from magshell_fenicsx.continuation.iterates import FULL, Iterates, Step, Verdict
 from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat
 
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
+FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # ratio of two such steps, and part of the tolerance, for which the error is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
-FAR = "the first guess is too far away"
+DIVERGED, FAR = "the iteration diverged", "the first guess is too far away"
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 Reason = PETSc.SNES.ConvergedReason
@@ -39,7 +39,7 @@ REASON_OF: dict[Verdict, Any] = {
     "rounding": Reason.DIVERGED_INNER,
 }
 IN_WORDS = {
-    Reason.DIVERGED_DTOL: "the iteration diverged",
+    Reason.DIVERGED_DTOL: DIVERGED,
     Reason.DIVERGED_LOCAL_MIN: FAR,
     Reason.DIVERGED_INNER: HIDDEN,
     Reason.DIVERGED_MAX_IT: "too many iterations",
@@ -272,6 +272,14 @@ class Linearised:
         if len(steps) > 1 and steps[-1] <= CERTAIN * steps[-2] and steps[-1] ** 2 <= CERTAIN * least * steps[-2]:
             return -1.0
         return max(least, float(FORESEEN ** (1 + len(steps) / 2)) * self._ventured)
+
+    def misled(self) -> bool:
+        """Whether the last step would have been much shorter, or none, with computed forces in place of foreseen ones."""
+        if not (self._foreseen and self._state and self._chord and self.matrix):
+            return True
+        state, before = self._state, self._iterates.steps[-1].size
+        R = self._system.residual(state.u, state.mu), self._row.residual(state)
+        return not self.matrix.size(self._chord.step(R)) > FULL * before
 
     def _again(self, f: Direction) -> Direction:
         """The next step by the same matrix, in place of one with foreseen forces."""

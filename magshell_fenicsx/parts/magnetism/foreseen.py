@@ -12,7 +12,7 @@ from magshell_fenicsx.assembly.whole import Blocks
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 
 Array = NDArray[np.float64]
-POINTS, MOST = 3, 2  # of the path that are remembered, and coefficients of the polynomial along it
+POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it
 CHANGES = 4  # beside the path that are remembered
 TOGETHER = 0.5  # states nearer to each other than this part of the way from the point before belong to one point
 OWN = 0.3  # of a change: what newer ones do not have, at least
