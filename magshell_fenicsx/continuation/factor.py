@@ -255,7 +255,6 @@ class Factorisation:
             self._pc.apply(self._rhs, self._solution)
             return np.array(self._solution.array_r)
 
-
     def _backs(self, columns: Array) -> Array:
         """K^-1 times columns, all at once."""
         assert self._pc is not None

@@ -14,7 +14,16 @@ import numpy as np
 
 from magshell_fenicsx.continuation.control import Bordered, Row, plus, refined_tangent
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.snes import DIVERGED, FAR, HIDDEN, IN_WORDS, Linearised, NewtonOptions, Tangents, make_snes
+from magshell_fenicsx.continuation.snes import (
+    DIVERGED,
+    FAR,
+    HIDDEN,
+    IN_WORDS,
+    Linearised,
+    NewtonOptions,
+    Tangents,
+    make_snes,
+)
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
 
 

@@ -274,9 +274,9 @@ class Linearised:
         return max(least, float(FORESEEN ** (1 + len(steps) / 2)) * self._ventured)
 
     def misled(self) -> bool:
-        """Whether the last step would have been much shorter, or none, with computed forces in place of foreseen ones."""
+        """Whether the last step had foreseen forces and is much shorter with computed ones, or had computed ones."""
         if not (self._foreseen and self._state and self._chord and self.matrix):
-            return True
+            return True  # nothing is known of it
         state, before = self._state, self._iterates.steps[-1].size
         R = self._system.residual(state.u, state.mu), self._row.residual(state)
         return not self.matrix.size(self._chord.step(R)) > FULL * before

@@ -83,11 +83,11 @@ class Foreseen:
 
     def _turn(self, u: Array, D: ActingOnEachOther, of_D: Array) -> None:
         """Take D as it is at another state, if nodes have turned enough."""
-        anew = D is not self._D or self._turned is None
-        if not anew and 2 * np.abs(self._turns(u, self._turned)[:, :3]).max() < TURNED:
+        before = self._turned if D is self._D else None
+        if before is not None and 2 * np.abs(self._turns(u, before)[:, :3]).max() < TURNED:
             return
         turned = D.turned(self._turns(u, of_D))
-        if turned is None and not anew:
+        if turned is None and before is not None:
             return
         self._D, self._stored, self._turned = D, D.stored if turned is None else turned, u
         self._last = self._model = None
@@ -144,9 +144,9 @@ class Along:
         if before is None:
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
         direction, way = base.u - before.u, float(np.linalg.norm(base.u - before.u))
-        direction = direction / way
+        direction = np.asarray(direction / way)
         rows, values, places = list[Array](), list[Array](), [0.0]
-        powers = np.arange(1, MOST + 1)
+        powers = np.arange(1.0, MOST + 1)
         for point in reversed(points):
             last = point[-1]
             s = last.u - base.u
@@ -155,18 +155,19 @@ class Along:
                 if abs(at) < STRAIGHT * size or min(abs(at - x) for x in places) < APART * max(1.0, abs(at)):
                     continue
                 places.append(at)
-                rows.append(at**powers)
+                rows.append(np.asarray(at**powers))
                 values.append(last.rest - base.rest)
             if len(point) > 1 and len(rows) < MOST:
                 change = last.u - point[-2].u
                 step, length = float(direction @ change) / way, float(np.linalg.norm(change)) / way
                 if STRAIGHT * length < abs(step) and length < SLOPE:
-                    rows.append((at**powers - (at - step) ** powers) / step)
-                    values.append((last.rest - point[-2].rest) / step)
+                    rows.append(np.asarray((at**powers - (at - step) ** powers) / step))
+                    values.append(np.asarray((last.rest - point[-2].rest) / step))
             if len(rows) == MOST:
                 break
         n = len(rows)
-        return cls(base, direction, way, np.linalg.solve(np.array(rows)[:, :n], np.array(values)))
+        coefficients = np.linalg.solve(np.array(rows)[:, :n], np.array(values))
+        return cls(base, direction, way, np.asarray(coefficients, dtype=np.float64))
 
     def rest(self, u: Array) -> Array:
         """At a state, on the path."""

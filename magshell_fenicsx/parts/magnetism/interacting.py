@@ -73,7 +73,9 @@ class InteractionTerm:
         self._seen: tuple[Array, float, Array] | None = None
         self._blocks = Blocks(self._comm)
         self._foreseen = Foreseen(self._blocks, self._turns)
-        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = None  # beside its nodes and u
+        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
+            None  # beside its nodes and u
+        )
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""
@@ -204,7 +206,12 @@ class InteractionTerm:
         own = own_field(self._sight)
         given = r0, self._cells.gathered(own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list])
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen(self._blocks, self._turns)
+            self._given, self._seen, self._stiff, self._foreseen = (
+                given,
+                None,
+                None,
+                Foreseen(self._blocks, self._turns),
+            )
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])

@@ -30,7 +30,8 @@ FUNCTIONS = """
     void turn_blocks(int64_t, const int32_t *, const int32_t *, const double *, const double *, double, const double *,
         const int64_t *, const double *, float *);
 """
-KINDS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")} | {np.dtype(float): "double[]", np.dtype(np.float32): "float[]"}
+INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
+KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
 
 
 @dataclass(frozen=True)
