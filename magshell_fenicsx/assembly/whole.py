@@ -10,19 +10,26 @@ and the cube of the number of unknowns.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import bsr_array, csr_array
 
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.continuation.system import Beside, Rest, Vector
+from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 COLUMNS = 128  # for which products are computed at once where all entries are needed
+FUNCTIONS = """
+    void of_doubles(int64_t, const int32_t *, const int32_t *, const double *, const double *, double *);
+    void of_floats(int64_t, const int32_t *, const int32_t *, const float *, const double *, double *);
+"""
 
 
 class Acting(Protocol):
@@ -50,6 +57,24 @@ class WholeTerm(Term, Protocol):
 
     def add_foreseen(self, b: Array, factor: float) -> None:
         """As `add_residual`, by what is known of states near by; collective."""
+
+
+class Blocks:
+    """Products of matrices of (3, 3) blocks with vectors; the constructor is collective."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self._ffi, self._lib = native(Path(__file__).with_name("whole.c"), FUNCTIONS, comm)
+
+    def times(self, A: bsr_array, v: Array) -> Array:
+        """A v; the entries of A may be single ones."""
+        product, p = np.empty(A.shape[0]), self._ffi.from_buffer
+        starts, columns = (np.asarray(each, dtype=np.int32) for each in (A.indptr, A.indices))
+        values, x = np.ascontiguousarray(A.data), np.tile(v.reshape(-1, 3), 3)
+        single = values.dtype == np.float32
+        arrays = p("int32_t[]", starts), p("int32_t[]", columns), p("float[]" if single else "double[]", values)
+        of_these = self._lib.of_floats if single else self._lib.of_doubles
+        of_these(len(starts) - 1, *arrays, p("double[]", x), p("double[]", product))
+        return product
 
 
 @dataclass(frozen=True)
@@ -120,6 +145,7 @@ class WholeMatrix:
         for bc in clamped:
             dofs = bc.dof_indices()[0]
             held[dofs[dofs < n]] = True
+        self._blocks = Blocks(comm)
         self.comm, self.held = comm, (held, np.concatenate(comm.allgather(held)))
         self._whole: tuple[Array, Array, PETSc.Mat] | None = None
         self._stored: dict[str, tuple[Acting, bsr_array]] = {}
@@ -202,7 +228,7 @@ class WholeMatrix:
         product = np.zeros(3 * self._owned)
         for part in parts:
             others = part.acting.times_others(whole[:, None]).reshape(-1, 3)
-            product += part.factor * (part.stored @ whole + self._own(others).ravel())
+            product += part.factor * (self._blocks.times(part.stored, whole) + self._own(others).ravel())
             if part.left_out is not None:
                 product -= part.factor * (part.left_out @ whole)
         return product

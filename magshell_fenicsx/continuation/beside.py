@@ -85,18 +85,18 @@ class Solver:
 
     Parameters
     ----------
-    back
-        K^-1 times a vector.
+    back, backs
+        K^-1 times a vector, and times columns.
     """
 
-    def __init__(self, back: Map, of: Remembered, comm: MPI.Comm, size: int) -> None:
+    def __init__(self, back: Map, backs: Map, of: Remembered, comm: MPI.Comm, size: int) -> None:
         self._back, self._of, self._comm = back, of, comm
         # u, and c = (I + A) u, orthonormal: columns, of which so many are kept
         self._U, self._C = (np.empty((size, KEPT + MOST), order="F") for _ in range(2))
         self._count = 0
         if of.pairs:
             U, products = (np.column_stack(each) for each in zip(*of.pairs, strict=True))
-            C = U + np.column_stack([back(product) for product in products.T])
+            C = U + backs(products)
             for _ in range(2):
                 squares, Q = np.linalg.eigh(comm.allreduce(C.T @ C))
                 kept = squares > DEPENDENT * squares[-1]

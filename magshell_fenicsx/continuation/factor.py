@@ -243,7 +243,7 @@ class Factorisation:
         if self._rest is None:
             return self._back(rhs)
         assert self._remembered
-        self._solver = self._solver or Solver(self._back, self._remembered, self.comm, len(rhs))
+        self._solver = self._solver or Solver(self._back, self._backs, self._remembered, self.comm, len(rhs))
         return self._solver.solve(self._back(rhs), ROUGH if rough else TOLERANCE)
 
     def _back(self, rhs: Vector) -> Vector:
@@ -254,6 +254,16 @@ class Factorisation:
             self._rhs.setArray(rhs)
             self._pc.apply(self._rhs, self._solution)
             return np.array(self._solution.array_r)
+
+    def _backs(self, columns: Array) -> Array:
+        """K^-1 times columns, all at once."""
+        assert self._pc is not None
+        rows = (len(columns), PETSc.DETERMINE)
+        B = PETSc.Mat().createDense((rows, columns.shape[1]), array=np.array(columns, order="F"), comm=self.comm)
+        X = B.duplicate()
+        with self.solving:
+            self._pc.matApply(B, X)
+            return np.array(X.getDenseArray())
 
 
 def has_cholmod() -> bool:

@@ -14,7 +14,16 @@ import numpy as np
 
 from magshell_fenicsx.continuation.control import Bordered, Row, plus, refined_tangent
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.snes import HIDDEN, IN_WORDS, Linearised, NewtonOptions, Tangents, make_snes
+from magshell_fenicsx.continuation.snes import (
+    DIVERGED,
+    FAR,
+    HIDDEN,
+    IN_WORDS,
+    Linearised,
+    NewtonOptions,
+    Tangents,
+    make_snes,
+)
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
 
 
@@ -110,7 +119,8 @@ class BorderedNewton:
             A longer step, in lengths, ends the solve early, and so do steps that lead astray: see `Iterates.hasty`.
         """
         outcome = self._solved(self._snes, guess, name, row, stress, near, most, foreseeing=self._tangents.foresees)
-        if not outcome.converged and self._linear.foreseeing:
+        far = outcome.reason in (DIVERGED, FAR)
+        if not outcome.converged and self._linear.foreseeing and not (far and not self._linear.misled()):
             outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
             again = self._solved(self._searching, guess, name, row, stress)

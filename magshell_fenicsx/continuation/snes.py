@@ -16,18 +16,18 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict, foreseen
+from magshell_fenicsx.continuation.iterates import FULL, Iterates, Step, Verdict, foreseen
 from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat
 
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-FORESEEN = 0.03  # a step with foreseen forces over those since they were computed: below it they are computed again
+FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
-FAR = "the first guess is too far away"
+DIVERGED, FAR = "the iteration diverged", "the first guess is too far away"
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 Reason = PETSc.SNES.ConvergedReason
@@ -39,7 +39,7 @@ REASON_OF: dict[Verdict, Any] = {
     "rounding": Reason.DIVERGED_INNER,
 }
 IN_WORDS = {
-    Reason.DIVERGED_DTOL: "the iteration diverged",
+    Reason.DIVERGED_DTOL: DIVERGED,
     Reason.DIVERGED_LOCAL_MIN: FAR,
     Reason.DIVERGED_INNER: HIDDEN,
     Reason.DIVERGED_MAX_IT: "too many iterations",
@@ -269,6 +269,14 @@ class Linearised:
         if foreseen(self._computed, 1) <= CERTAIN * least:  # one ratio: each costs much
             return -1.0
         return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
+
+    def misled(self) -> bool:
+        """Whether the last step had foreseen forces and is much shorter with computed ones, or had computed ones."""
+        if not (self._foreseen and self._state and self._chord and self.matrix):
+            return True  # nothing is known of it
+        state, before = self._state, self._iterates.steps[-1].size
+        R = self._system.residual(state.u, state.mu), self._row.residual(state)
+        return not self.matrix.size(self._chord.step(R)) > FULL * before
 
     def _again(self, f: Direction) -> Direction:
         """The next step by the same matrix, in place of one with foreseen forces."""

@@ -81,6 +81,7 @@ class Far:
         self._filled, self._first = np.unique(box[self._order], return_index=True)
         self._middle = self._leaf.middle[box[self._order]]
         self._q = np.concatenate([points.q.ravel() for _, points in kinds])[self._order]
+        self._octants = [list(_octants(level.keys)) for level in tree.levels]
 
     def placed(self, nodes: Array) -> Placed:
         """The charges on cells with nodes (cells, k, 3)."""
@@ -157,20 +158,24 @@ class Far:
     def onto(self, M: Array) -> Array:
         """L = G M times the width, of the boxes (boxes, COUNT, n) of the finest level."""
         levels, moments = self._tree.levels, [M]
-        for level, larger in zip(levels[:0:-1], levels[-2::-1], strict=True):
-            up = np.zeros((len(larger.keys), *M.shape[1:]))
-            for Z, boxes in _octants(level.keys):
+        for k, level in reversed(list(enumerate(levels))[1:]):
+            up = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
+            for Z, boxes in self._octants[k]:
                 up[level.parent[boxes]] += _times(Z, moments[0][boxes])
             moments.insert(0, up)
         L = np.zeros_like(moments[0])
         for k, (level, of_level) in enumerate(zip(levels, moments, strict=True)):
             if k:
                 down = np.empty_like(of_level)
-                for Z, boxes in _octants(level.keys):
+                for Z, boxes in self._octants[k]:
                     down[boxes] = _times(Z.T, L[level.parent[boxes]]) / 2  # over half the width
                 L = down
             self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
         return L
+
+    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array) -> NDArray[np.float32] | None:
+        """See `Pairs.turned`."""
+        return self._pairs.turned(near, sign, numbers, q)
 
     def between(self, moments: Array) -> tuple[Ints, Array]:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
@@ -208,8 +213,8 @@ class Cells:
         The cells of this rank.
     rows
         (own cells, k) local numbers.
-    local
-        Number of local nodes.
+    numbers
+        (local nodes,) global ones.
     turn
         (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
     """
@@ -217,7 +222,7 @@ class Cells:
     nodes: NDArray[np.intp]
     own: range
     rows: Ints
-    local: int
+    numbers: Ints
     turn: Array
 
     def of_copies(self, v: Array, sign: float) -> Array:
@@ -228,9 +233,9 @@ class Cells:
 
     def summed(self, f: Array) -> Array:
         """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
-        summed_up = np.zeros((self.local, 3, f.shape[-1]))
+        summed_up = np.zeros((len(self.numbers), 3, f.shape[-1]))
         np.add.at(summed_up, self.rows, f.reshape(*self.rows.shape, 3, -1))
-        return summed_up.reshape(3 * self.local, -1)
+        return summed_up.reshape(3 * len(self.numbers), -1)
 
 
 @dataclass(frozen=True)
@@ -257,6 +262,11 @@ class ActingOnEachOther:
         """See `assembly.whole.Acting`."""
         return self.near.matrix(self.sign)
 
+    def turned(self, q: Array) -> bsr_array | None:
+        """What is stored, in single precision, where nodes are turned by q (nodes, 4); None of several images."""
+        blocks = self.far.turned(self.near, self.sign, self.cells.numbers, q)
+        return None if blocks is None else bsr_array((blocks, self.near.columns, self.near.starts), self.near.shape)
+
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
@@ -270,7 +280,7 @@ def _each(B: Array, v: Array) -> Array:
 
 
 def _times(Z: Array, M: Array) -> Array:
-    return np.asarray(np.tensordot(M, Z, axes=(1, 1)).swapaxes(1, 2), dtype=np.float64)
+    return (M[..., 0] @ Z.T)[..., None] if M.shape[-1] == 1 else np.asarray(Z @ M)
 
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:

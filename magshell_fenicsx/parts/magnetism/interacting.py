@@ -2,7 +2,6 @@
 
 from copy import copy
 from functools import cached_property
-from itertools import count, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,13 +11,16 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
+from magshell_fenicsx.assembly.whole import Blocks
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.by_charges import Weights
-from magshell_fenicsx.parts.magnetism.charged import Shape
+from magshell_fenicsx.parts.magnetism.charged import Shape, unit
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
+from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
@@ -30,66 +32,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-CHANGES = 4  # latest ones that are remembered
-OWN = 0.3  # of a change: what newer ones do not have, at least
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
-class Foreseen:
-    """Forces near a state at which they were computed, by an earlier second derivative D and latest changes.
-
-    Of the latest states s are the differences and y those of their forces: what y - D s are along s is added to D, that
-    of the newest first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
-    """
-
-    def __init__(self) -> None:
-        self._known = list[tuple[Array, Array]]()  # u of all nodes and this rank's part of the forces, the newest last
-        self._of: ActingOnEachOther | None = None
-        self._products = dict[int, Array]()  # D s, by the number of the later state
-        self._count = 0
-        self._basis: list[tuple[Array, Array]] | None = None
-
-    def learn(self, u: Array, forces: Array) -> None:
-        """Forces at a state."""
-        self._known, self._basis, self._count = [*self._known[-CHANGES:], (u, forces)], None, self._count + 1
-
-    def at(self, u: Array, D: "ActingOnEachOther") -> Array | None:
-        """This rank's part of the forces; None if nothing is known."""
-        if not self._known:
-            return None
-        before, forces = self._known[-1]
-        s = u - before
-        foreseen = forces + _product(D, s)
-        for q, y in self._changes(D):
-            foreseen += (q @ s) * y
-        return foreseen
-
-    def _changes(self, D: "ActingOnEachOther") -> list[tuple[Array, Array]]:
-        """Orthonormal changes of u, and what D lacks along them."""
-        if D is not self._of:
-            self._of, self._products, self._basis = D, {}, None
-        if self._basis is None:
-            self._basis, newest = [], self._count
-            pairs = list(pairwise(reversed(self._known)))
-            self._products = {k: v for k, v in self._products.items() if k > newest - len(pairs)}
-            for number, ((u, forces), (u0, forces0)) in zip(count(newest, -1), pairs):
-                s = u - u0
-                if number not in self._products:
-                    self._products[number] = _product(D, s)
-                y, size = forces - forces0 - self._products[number], float(np.linalg.norm(s))
-                for _ in range(2):
-                    for q, of_q in self._basis:
-                        part = float(q @ s)
-                        s, y = s - part * q, y - part * of_q
-                rest = float(np.linalg.norm(s))
-                if rest > OWN * size:
-                    self._basis.append((np.asarray(s / rest), np.asarray(y / rest)))
-        return self._basis
-
-
-def _product(D: "ActingOnEachOther", v: Array) -> Array:
-    return np.asarray(D.stored @ v + D.times_others(v[:, None]).ravel())
+def polar(F: Array) -> Array:
+    """The rotations nearest to matrices (n, 3, 3) with positive determinants."""
+    U, _, V = np.linalg.svd(F)
+    return np.asarray(U @ V)
 
 
 class InteractionTerm:
@@ -121,8 +71,11 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
-        self._foreseen = Foreseen()
-        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther]] | None = None  # and its deformed nodes
+        self._blocks = Blocks(self._comm)
+        self._foreseen = Foreseen(self._blocks, self._turns)
+        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
+            None  # beside its nodes and u
+        )
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""
@@ -167,7 +120,7 @@ class InteractionTerm:
     def add_foreseen(self, b: Array, factor: float) -> None:
         """See `assembly.whole.WholeTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
-        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0]) if self._stiff else None
+        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2]) if self._stiff else None
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
 
     def compile_tangent(self) -> None:
@@ -185,7 +138,7 @@ class InteractionTerm:
         nodes = self._nodes()
         if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
             self._stiff = None  # two are not kept at once
-            self._stiff = nodes, self._acting_at(nodes)
+            self._stiff = nodes, self._acting_at(nodes), whole(self._u).ravel()
         return self._stiff[1]
 
     def by_field(
@@ -241,7 +194,8 @@ class InteractionTerm:
             self._charged.evaluate(nodes, own, stiffness)
         except Touching:
             stiffness.blocks[:] = np.nan
-        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], local, turn)
+        numbers = V.dofmap.index_map.local_to_global(np.arange(local, dtype=np.int32))
+        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
             ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
@@ -274,10 +228,29 @@ class InteractionTerm:
         if factor is not None:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff, self._foreseen = given, None, None, Foreseen()
+            self._given, self._seen, self._stiff, self._foreseen = (
+                given,
+                None,
+                None,
+                Foreseen(self._blocks, self._turns),
+            )
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])
+
+    def _turns(self, u: Array, before: Array) -> Array:
+        """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar last."""
+        r0, nodes = whole(self._model.r0), self._cells.nodes
+        element = self._all()[0].element
+        T = element.tabulate(1, element.points)[1:, :, :, 0]
+
+        def frames(u: Array) -> Array:
+            a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
+            return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
+
+        F = np.zeros((len(r0), 3, 3))
+        np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(before)))
+        return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
     def _charged(self) -> Charged:

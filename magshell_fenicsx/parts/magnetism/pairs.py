@@ -27,8 +27,11 @@ FUNCTIONS = """
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
         int64_t, const double *, const double *, double *);
+    void turn_blocks(int64_t, const int32_t *, const int32_t *, const double *, const double *, double, const double *,
+        const int64_t *, const double *, float *);
 """
-KINDS = {"float64": "double[]", "int64": "int64_t[]", "int32": "int32_t[]", "uint8": "uint8_t[]", "int8": "int8_t[]"}
+INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
+KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
 
 
 @dataclass(frozen=True)
@@ -120,9 +123,9 @@ class Stiffness:
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
         number = np.where(beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1).astype(np.int32)
         self._count = int(np.count_nonzero(beside))
-        self._columns = np.nonzero(beside)[1]
-        self._starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))])
-        self._shape = 3 * beside.shape[0], 3 * beside.shape[1]
+        self.columns = np.nonzero(beside)[1].astype(np.int32)
+        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))]).astype(np.int32)
+        self.shape = 3 * beside.shape[0], 3 * beside.shape[1]
         of_images = [number + self._count] if len(turn) > 1 else []
         self.where = np.concatenate([number, *of_images], axis=1)
         self.blocks = np.zeros((self._count * (1 + len(of_images)), 3, 3))
@@ -144,7 +147,7 @@ class Stiffness:
         """(3 local nodes, 3 all nodes), with the columns of images times the sign."""
         of_itself, of_images = self.blocks[: self._count], self.blocks[self._count :]
         return bsr_array(
-            (of_itself + sign * of_images if len(of_images) else of_itself, self._columns, self._starts), self._shape
+            (of_itself + sign * of_images if len(of_images) else of_itself, self.columns, self.starts), self.shape
         )
 
 
@@ -262,9 +265,23 @@ class Pairs:
                 len(one), *numbers, M.shape[1], p(ends), G.shape[1], M.shape[2], *(p(each) for each in arrays), p(L)
             )
 
+    def turned(self, stiffness: Stiffness, sign: float, number: Ints, q: Array) -> NDArray[np.float32] | None:
+        """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes, 4), scalar last.
+
+        None where there are several images, whose blocks are not stored apart.
+        """
+        starts, columns, count = stiffness.starts, stiffness.columns, len(stiffness.columns)
+        if len(stiffness.turn) > 2:
+            return None
+        p, turned = self._pointer, np.empty((count, 3, 3), dtype=np.float32)
+        images = p(stiffness.blocks[count:]) if len(stiffness.turn) > 1 else self._ffi.NULL
+        arrays = p(starts), p(columns), p(stiffness.blocks[:count]), images, sign, p(stiffness.turn[-1])
+        self._lib.turn_blocks(len(starts) - 1, *arrays, p(number), p(q), p(turned))
+        return turned
+
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype.name], array)
+        return self._ffi.from_buffer(KINDS[array.dtype], array)
 
 
 def _filled(rows: Ints, idle: int) -> Ints:

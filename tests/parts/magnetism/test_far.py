@@ -86,7 +86,7 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     beside = np.kron(near | np.eye(len(nodes), dtype=bool), np.ones(2 * [numbers.shape[1]], dtype=bool))
     stiffness = Stiffness(beside, 1.0, numbers, numbers, np.eye(3)[None])
     _, gradient = charges.evaluate(nodes, own, stiffness)
-    cells = Cells(numbers, own, numbers, numbers.size, stiffness.turn)
+    cells = Cells(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
     acting = ActingOnEachOther(stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0)
     product = acting.stored @ v.ravel() + acting.times_others(v.reshape(-1, 1))[:, 0]
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))

@@ -171,6 +171,13 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     assert change == pytest.approx(gradient(half, bend.ravel()) @ v.ravel(), rel=1e-6)
     slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
+    term._u.x.array[:] = 0.0
+    flat = term.both(rough=False)[0]
+    turned = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel()))
+    assert np.abs(turned - turned.T).max() < 1e-6 * np.abs(turned).max()
+    products = [stored @ v.ravel() + flat.times_others(v.reshape(-1, 1))[:, 0] for stored in (flat.stored, turned)]
+    as_it_was, with_nodes = (np.linalg.norm(each - slope) for each in products)
+    assert with_nodes < min(0.3 * as_it_was, 0.02 * np.linalg.norm(slope)), "the bend stretches by 4 %, too"
     K = rows_of(systems[0], states[0], terms[0])
     for sign in (1.0, -1.0):
         v, V = smooth(of, sign), np.zeros_like(x)
