@@ -106,7 +106,9 @@ class Path:
         scale: float = 1.0,
         journal: Journal | None = None,
         progress: Progress | None = None,
+        until: Callable[[State, State], float] | None = None,
     ) -> None:
+        self._until = until
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
@@ -262,6 +264,10 @@ class Path:
                 if smooth:
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
+                part = self._until(here.state, self._extended(s, passed[-3:] if smooth else passed[-2:])) if self._until else 1.0
+                if part < 1:
+                    print("UNTIL", part, s)
+                    s = here.s + part * (s - here.s)
                 tried = self._try(s, passed[-3:] if smooth else passed[-2:])
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
@@ -277,9 +283,9 @@ class Path:
                 o = self.options
                 if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
                     step = min(max(step, 1.5 * length), o.largest)
-                elif tried.factorisations >= o.hard:
+                elif tried.factorisations >= o.hard and part == 1:
                     step = 0.6 * length
-                before = [] if self._corner(here, tried) else passed[1 - LOOKED_BACK :]
+                before = [] if part < 1 or self._corner(here, tried) else passed[1 - LOOKED_BACK :]
                 passed, here = [*before, tried], tried
                 yield here, here.s == target
                 if not far:

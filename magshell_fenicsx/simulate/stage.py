@@ -1,6 +1,7 @@
 """The solver of a step of a programme."""
 
 from collections.abc import Mapping
+from functools import partial
 from dataclasses import dataclass, replace
 
 from magshell_fenicsx.continuation.device import Along, Curve, Device, Held, natural_scale
@@ -73,7 +74,9 @@ class Stage:
         """
         if control == "conjugate":
             _refuse_open(self.scene, name)
-        return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
+        from magshell_fenicsx.simulate.touch import way_to_contact
+        until = partial(way_to_contact, self) if self.scene.model.touchings else None
+        return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress, until)
 
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
         """A path from a state of the model in equilibrium; its first step changes the amplitude by about `first`.

@@ -99,6 +99,15 @@ def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
     return [(each.pair, at.of(each.penetration)) for each in scene.model.touchings]
 
 
+def way_to_contact(stage: Stage, low: State, guess: State) -> float:
+    """The part of the straight way to a guess after which shells touch that do not yet; 1 if none do."""
+    model, comm = stage.scene.model, stage.scene.comm
+    ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low, guess))]
+    ends = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
+    parts = [each.onset(*ends, DEEP[0] * stage.scene.problem.material.h) for each in model.touchings if isinstance(each, Touching)]
+    return min(parts, default=1.0)
+
+
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     """See that no shell passes through another one, or itself, on the straight way between two points.
 

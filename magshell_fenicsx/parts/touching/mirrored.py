@@ -136,3 +136,6 @@ class Mirrored(Touching):
 
     def through(self, u: Array, v: Array) -> bool:
         return super().through(self._images.moved(u), self._images.moved(v))
+
+    def onset(self, u: Array, v: Array, deep: float) -> float:
+        return super().onset(self._images.moved(u), self._images.moved(v), deep)
