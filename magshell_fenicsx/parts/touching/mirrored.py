@@ -134,8 +134,5 @@ class Mirrored(Touching):
         rows, columns = super().around()
         return rows % self._images.count, columns % self._images.count
 
-    def through(self, u: Array, v: Array) -> bool:
-        return super().through(self._images.moved(u), self._images.moved(v))
-
-    def onset(self, u: Array, v: Array, deep: float) -> float:
-        return super().onset(self._images.moved(u), self._images.moved(v), deep)
+    def _of_copies(self, u: Array) -> Array:
+        return self._images.moved(u)

@@ -297,47 +297,22 @@ class Touching:
         half = self._faces.half(self._now() if u is None else u) if self._faces else self._h / 2
         return min(1.0, 2 * float(np.min(half)) / self._h)
 
-    def onset(self, u: Array, v: Array, deep: float) -> float:
-        """The part of the straight way between two displacements of all nodes after which faces that do not touch
-        yet press by about `deep`; 1 where they do not meet, or touch already; collective."""
-        if not self._facing.near_on_way(u, v):
-            return 1.0
-        moved = v - u
-        most = 2 * float(np.linalg.norm(moved - moved.mean(axis=0), axis=1).max())
+    def meet(self, u: Array, v: Array) -> bool:
+        """Whether any cells come near each other between two displacements of all nodes; collective."""
+        return self._facing.near_on_way(self._of_copies(u), self._of_copies(v))
 
-        def gap(part: float) -> float:
-            places = self._facing.found(u + part * moved, REACH * self._h)
-            return min(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN), REACH * self._h) - self._h
-
-        low, high, at_low, at_high = 0.0, np.inf, gap(0.0), 0.0
-        if at_low <= 0:
-            return 1.0
-        before = None
-        n=0
-        while low < 1:
-            n+=1
-            sure = low + (at_low + NEARER * self._h) / most if most else 1.0
-            part = min(1.0, sure)
-            if high <= 1:
-                part = low + (high - low) * (at_low + deep) / (at_low - at_high)
-            elif before and before[1] > at_low:
-                part = min(part, low + (low - before[0]) * (at_low + deep) / (before[1] - at_low))
-            now = gap(part)
-            print("   ONSET", n, part, now/self._h, high)
-            if now > 0:
-                before = low, at_low
-                low, at_low = part, now
-            elif now > -2 * deep or n > 30:
-                return part
-            else:
-                high, at_high = part, now
-        return 1.0
+    def gap(self, u: Array) -> float:
+        """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
+        far = REACH * self._h
+        least = self._facing.found(self._of_copies(u), far).distance.min(initial=far)
+        return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
 
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
 
         Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
+        u, v = self._of_copies(u), self._of_copies(v)
         moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
@@ -392,6 +367,10 @@ class Touching:
 
     def _now(self) -> Array:
         return self._u()
+
+    def _of_copies(self, u: Array) -> Array:
+        """The displacement of all that is faced, of the nodes that are modelled."""
+        return u
 
     def _forces(self) -> Array:
         """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
