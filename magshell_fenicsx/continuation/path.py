@@ -22,7 +22,6 @@ BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end
 LOOKS = 2  # at a point that was found too far away; a third point before it means that it is on another branch
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
-PARTS = 64  # of a step, of which a shorter one has a whole number: so that rounding ends no step elsewhere
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
@@ -337,8 +336,7 @@ class Path:
         cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
         allowed = max(GUESSED * self.system.length, WORSE * missed)
-        part = min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
-        return max(np.floor(PARTS * part), 1.0) / PARTS
+        return min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:
         """How far a point is from where earlier ones led."""
