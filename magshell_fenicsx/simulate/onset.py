@@ -40,7 +40,8 @@ def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, gue
 def of_all_nodes(scene: Scene, state: State) -> Array:
     """The displacement (nodes, 3) of all ranks; collective."""
     system = scene.model.system
-    return np.concatenate(scene.comm.allgather(system.with_ghosts(state.u, state.mu)[: system.size])).reshape(-1, 3)
+    parts = scene.comm.allgather(system.with_ghosts(state.u, state.mu)[: system.size])
+    return np.asarray(np.concatenate(parts).reshape(-1, 3))
 
 
 def _onset(touching: Touching, h: float, u: Array, v: Array) -> float:
