@@ -95,6 +95,9 @@ class Path:
         Records every result of `recorded`, and replays the results of an interrupted run.
     progress
         Gets every step before it is tried.
+    setting_in
+        The part of the straight way from a point to a first guess just behind which forces set in: a step ends there.
+        Zero if the guess loses forces of the point: then its tangent alone foresees the next one.
     """
 
     def __init__(
@@ -106,6 +109,7 @@ class Path:
         scale: float = 1.0,
         journal: Journal | None = None,
         progress: Progress | None = None,
+        setting_in: Callable[[State, State], float] = lambda here, guess: 1.0,
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
@@ -113,6 +117,7 @@ class Path:
         self._hard = 0  # number of solves that failed or took many matrices
         self._vain = 0  # number of solves that failed, one after the other
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
+        self._setting_in = setting_in
 
     def start(self, state: State, sense: float = 1.0) -> Point:
         """The first point of a path, from a state in equilibrium.
@@ -254,7 +259,7 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        o, passed, step, leaps, far = self.options, [start], self.options.first, 0, None
+        o, passed, step, leaps, far, vain = self.options, [start], self.options.first, 0, None, None
         for target in targets:
             while (here := passed[-1]).s != target:
                 way = target - here.s
@@ -266,9 +271,17 @@ class Path:
                 if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
-                tried = self._try(s, passed[-3:] if smooth else passed[-2:])
+                seen = passed[-3:] if smooth else passed[-2:]
+                part = self._setting_in(here.state, self._extended(s, seen)) if here is not vain else 1.0
+                if not part:
+                    seen, part = passed[-1:], 1.0
+                s = here.s + part * (s - here.s) if part < 1 else s
+                tried = self._try(s, seen)
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
+                if isinstance(tried, str) and part < 1:
+                    vain = here
+                    continue
                 if isinstance(tried, str):
                     leaps += 1
                     over = tried == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
@@ -279,9 +292,9 @@ class Path:
                 leaps, straight = 0, self._cosine(here, tried) > o.straight
                 if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
                     step = min(max(step, min(step + length / 2, 2 * length)), o.largest)  # a target may have cut it
-                elif tried.factorisations >= o.hard:
+                elif tried.factorisations >= o.hard and part == 1:
                     step = 0.6 * length
-                before = [] if self._corner(here, tried) else passed[1 - LOOKED_BACK :]
+                before = [] if part < 1 or self._corner(here, tried) else passed[1 - LOOKED_BACK :]
                 passed, here = [*before, tried], tried
                 yield here, here.s == target
                 if not far:

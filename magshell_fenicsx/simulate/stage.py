@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from magshell_fenicsx.continuation.device import Along, Curve, Device, Held, natural_scale
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, System, Vector
+from magshell_fenicsx.simulate.onset import way_to_touch
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -73,7 +75,8 @@ class Stage:
         """
         if control == "conjugate":
             _refuse_open(self.scene, name)
-        return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
+        scene, given = self.scene, (self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
+        return Path(*given, partial(way_to_touch, scene, self.leave)) if scene.model.touchings else Path(*given)
 
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
         """A path from a state of the model in equilibrium; its first step changes the amplitude by about `first`.

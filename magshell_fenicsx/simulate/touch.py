@@ -17,6 +17,7 @@ from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import Touching
+from magshell_fenicsx.simulate.onset import of_all_nodes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -114,11 +115,11 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         places = [model.system.with_ghosts(s.u, s.mu).reshape(-1, 2) for s in map(stage.leave, (low.state, high.state))]
         _refuse_through(model.touchings, places)
         return
-    ends = [model.system.with_ghosts(state.u, state.mu) for state in map(stage.leave, (low.state, high.state))]
-    whole = [np.concatenate(comm.allgather(u[: model.system.size])).reshape(-1, 3) for u in ends]
+    end = stage.leave(high.state)
+    whole = [of_all_nodes(stage.scene, state) for state in (stage.leave(low.state), end)]
     x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
-    x = x0 + ends[1][: model.system.size].reshape(-1, 3)
-    at, touchings = model.system.at(stage.leave(high.state)), [t for t in model.touchings if isinstance(t, Touching)]
+    x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
+    at, touchings = model.system.at(end), [t for t in model.touchings if isinstance(t, Touching)]
     half = h / 2 * min(at.of(each.thinner) for each in touchings)
     seen_through = [*model.mirror.sides.values()] if model.multiplicity > 1 else []
     for plane in (each for each in model.planes if each not in seen_through):

@@ -134,5 +134,5 @@ class Mirrored(Touching):
         rows, columns = super().around()
         return rows % self._images.count, columns % self._images.count
 
-    def through(self, u: Array, v: Array) -> bool:
-        return super().through(self._images.moved(u), self._images.moved(v))
+    def _of_copies(self, u: Array) -> Array:
+        return self._images.moved(u)

@@ -297,11 +297,22 @@ class Touching:
         half = self._faces.half(self._now() if u is None else u) if self._faces else self._h / 2
         return min(1.0, 2 * float(np.min(half)) / self._h)
 
+    def meet(self, u: Array, v: Array) -> bool:
+        """Whether any cells come near each other between two displacements of all nodes; collective."""
+        return self._facing.near_on_way(self._of_copies(u), self._of_copies(v))
+
+    def gap(self, u: Array) -> float:
+        """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
+        far = REACH * self._h
+        least = self._facing.found(self._of_copies(u), far).distance.min(initial=far)
+        return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
+
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
 
         Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
+        u, v = self._of_copies(u), self._of_copies(v)
         moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
@@ -356,6 +367,10 @@ class Touching:
 
     def _now(self) -> Array:
         return self._u()
+
+    def _of_copies(self, u: Array) -> Array:
+        """The displacement of all that is faced, of the nodes that are modelled."""
+        return u
 
     def _forces(self) -> Array:
         """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
