@@ -323,8 +323,7 @@ class Segments:
         side = np.linalg.norm(np.einsum("na,nai->ni", along, c[:, 1:] - c[:, :1]), axis=1)
         corner = np.minimum(np.exp2(np.round(np.log2(self._before / side))), 1 / 64)  # of few values, so of few rules
         kind = np.stack([triangles.size <= 2 * LARGE, triangles.ends, np.where(triangles.ends > 0, corner, 0)], axis=1)
-        kinds, number = np.unique(kind, axis=0, return_inverse=True)
-        made = list[Points]()
+        made, (kinds, number) = list[Points](), np.unique(kind, axis=0, return_inverse=True)
         for k, (small, ends, part) in enumerate(kinds):
             degree = self._degrees[int(small)]
             rule = inner_rule(degree) if ends == INSIDE else ending_rule(degree, int(ends), float(part))
