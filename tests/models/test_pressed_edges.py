@@ -89,7 +89,7 @@ def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
 
 
 def test_a_corner(tmp_path: Path) -> None:
-    """A strip turned in its plane onto a corner, as a rigid body: the corner is as deep as it is, 0.02 h times the
+    """A strip turned in its plane onto a corner, as a rigid body: the corner is as deep as it is, 0.01 h times the
     slope, and differences are as those of an edge.
     """
     scene = Scene(Case.model_validate(standing(tmp_path, STEEP)))
@@ -105,7 +105,7 @@ def test_a_corner(tmp_path: Path) -> None:
     assert (r + u)[of_strip, 2].min() == pytest.approx(h - deep)
     u, v = u.ravel()[: system.size], 1e-8 * h * rng.standard_normal(system.size)
     at = system.at(State(u, mu))
-    assert at.of(term.penetration) == pytest.approx(deep, abs=0.02 * h * np.sin(tilt))
+    assert at.of(term.penetration) == pytest.approx(deep, abs=0.015 * h * np.sin(tilt))
     Kv = times([(1.0, at.of(term.entries))], v)
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()

@@ -31,9 +31,7 @@ LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
 SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
 CLOSE = 1e-9  # between corners that are one
 BEFORE = 1e-5  # of the height of a cell: how far the points of its edge are inside
-CORNER = (
-    0.02  # of the thickness: how far the point of a corner is from it; cells that meet in one opposite would share it
-)
+CORNER = 0.01  # of the thickness: how far a corner's point is before it, or cells that meet opposite would share it
 INSIDE = -1  # a triangle that is not on an edge
 TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that have points
 NOBODY = -1  # the cell that a part of a cell faces where none is
