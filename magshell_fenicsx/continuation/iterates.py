@@ -10,8 +10,8 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
-STEADY = 0.1  # steps that shrink more than to this part foresee the next ones
-SURE = 0.5, 0.1  # of the tolerance: an error that is foreseen, from several steps or from the first two alone
+STEADY = 0.1  # steps that twice shrink more than to this part foresee the next ones; once may be by chance
+SURE = 0.1  # part of the tolerance, for an error that is foreseen
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 
 Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
@@ -66,11 +66,15 @@ class Iterates:
 
     @property
     def foreseen(self) -> float:
-        """The error after the last step, if all further ones shrink as much as that; infinite if it shrank little."""
-        if self.kinks or self.searched or len(self.steps) < 2:
+        """The error after the last step, if all further ones shrink as the last two; infinite if one shrank little.
+
+        Bending may converge at once and hide stretching, which converges slowly: so one small ratio foresees nothing.
+        """
+        if self.kinks or self.searched or len(self.steps) < 3:
             return np.inf
-        rate = self.steps[-1].size / self.steps[-2].size
-        return self.steps[-1].size * rate / (1 - rate) if rate <= STEADY else np.inf
+        first, second, third = (step.size for step in self.steps[-3:])
+        rate = max(second / first, third / second)
+        return third * rate / (1 - rate) if rate <= STEADY else np.inf
 
     @property
     def error(self) -> float:
@@ -90,7 +94,7 @@ class Iterates:
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:
             return "far" if self.hasty else "diverged"
-        self.allowed = SURE[len(self.steps) == 2] * tolerance
+        self.allowed = SURE * tolerance * min(1.0, max(step.size for step in self.steps))
         if step.size <= tolerance or self.foreseen <= self.allowed:
             return "converged"
         own = [s for s in before if s.own]

@@ -142,18 +142,13 @@ class BorderedNewton:
         reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
         return Outcome(guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error)
 
-    def corrected(self, guess: State, name: str, row: Row, most: float, near: State) -> State | None:
-        """A guess after one step with the factors that stand; None if the step is too long.
-
-        Parameters
-        ----------
-        most
-            In lengths.
-        near
-            A state whose tangent is factored where no factors stand, as in a resumed run.
-        """
+    def stand_at(self, state: State) -> None:
+        """Factor the tangent at a state where no factors of this solver stand, as in a resumed run."""
         if self._tangents.state is None:
-            self._tangents.at(near, sure=False)
+            self._tangents.at(state, sure=False)
+
+    def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:
+        """A guess after one step, of at most so many lengths, with the factors that stand; None if it is longer."""
         system = self.system
         matrix = Bordered(system, self.factorisation, guess, name, row)
         step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess), rough=True)

@@ -148,14 +148,16 @@ class Path:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        return self.solve(self._row(s, base), s, self.between(s, low, high), stress, counted=counted)
+        near = None if counted else high.state
+        return self.solve(self._row(s, base), s, self.between(s, low, high), stress, near=near)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
         """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
 
         def find() -> Point | str:
             guess = self.between(s, low, high)
-            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT, high.state)
+            self.newton.stand_at(high.state)
+            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT)
             t = (s - low.s) / (high.s - low.s)
             along = Response((1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu, 0.0, low.negative_pivots)
             return self._point(state, s, along) if state else FAR
@@ -182,14 +184,14 @@ class Path:
         guess: State,
         stress: Sequence[Weighted] = (),
         *,
-        counted: bool = True,
+        near: State | None = None,
         most: float = np.inf,
     ) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
 
-        Unless it shall be `counted`, its number of unstable directions means nothing.
+        With a solution near by, old factors may begin, and the number of unstable directions means nothing.
         """
-        point = self.recorded(lambda: self._solve(row, s, guess, stress, counted, most))
+        point = self.recorded(lambda: self._solve(row, s, guess, stress, near, most))
         self._hard += point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
@@ -201,9 +203,11 @@ class Path:
             if isinstance(kept, Point):
                 factors.habit = kept.habit
             return kept
-        result = find()
+        habit, result = factors.habit, find()
         if isinstance(result, Point):
             result = replace(result, habit=factors.habit)
+        else:
+            factors.habit = habit  # a failure is kept as its reason alone
         self._journal.record(result)
         return result
 
@@ -408,16 +412,18 @@ class Path:
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
     def _solve(
-        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], counted: bool, most: float
+        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], near: State | None, most: float
     ) -> Point | str:
         before = self.newton.factorisation.count
-        near = 0.0 if counted else NEAR  # a tangent of the path must not depend on what was factored before its point
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=near, most=most)
+        if near:
+            self.newton.stand_at(near)
+        old = NEAR if near else 0.0  # a tangent of the path must not depend on what was factored before its point
+        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=old, most=most)
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
         exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
+        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=not near)
         point = self._point(outcome.state, s, response)
         return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 

@@ -77,7 +77,9 @@ class _Search:
         self.path.progress.doing("locating an instability")
         single = change == 1 or not halvings
         if single and turned:
-            yield Instability(self.finished(self.fold(low, high)), "fold")
+            point = self.finished(self.fold(low, high))
+            before = low.negative_pivots, low.negative_pivots_held  # rounding decides what its own matrix counts
+            yield Instability(replace(point, negative_pivots=before[0], negative_pivots_held=before[1]), "fold")
         elif single:
             point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):

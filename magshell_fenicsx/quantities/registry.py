@@ -96,7 +96,8 @@ OF_EVERY_RUN = (
     Quantity(
         "negative_pivots",
         "unstable directions",
-        "Number of unstable directions of the model, with all amplitudes fixed except those whose conjugate is held.",
+        "Number of unstable directions of the model, with all amplitudes fixed except those whose conjugate is held; "
+        "at a fold, the number before it.",
         "count",
     ),
     Quantity(

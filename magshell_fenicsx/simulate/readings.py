@@ -34,13 +34,15 @@ from magshell_fenicsx.simulate.numbers import number_of, size_of
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import conjugates
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.steps import stage_of
 
 Array = NDArray[np.float64]
+Placed = tuple[float, State]  # a place, and an equilibrium there
 STEP = 1e-4  # of what a change of a number is small against
 SAME = 1e-6  # relative difference of rates that are the same
 SLACK = 1e-9  # relative; a place so far beyond the path is its end
-
+TRIES = 4  # how often a place between two points comes nearer to one of them before it is given up
 
 ByField = Callable[[FieldGradient], Array]
 
@@ -275,19 +277,29 @@ class Read:
             reached = f"goes from {min(values):.6g} to {max(values):.6g}" if len(values) > 1 else "has no such point"
             why = f" ({self._lost})" if self._lost else ""
             raise Outside(f"{places.column} = {place:.6g} is outside the path, which {reached}{why}")
-        low, high = (each.point.state for each in way[k : k + 2])
-        part = float(np.clip((place - values[k]) / ((values[k + 1] - values[k]) or 1.0), 0.0, 1.0))
-        mu = {name: (1 - part) * value + part * high.mu.get(name, value) for name, value in low.mu.items()}
-        guess = self.scene.model.system.placed(State((1 - part) * low.u + part * high.u, mu))
-        stage = stage_of(self.scene, places.step, low)
-        row = places.row(stage.newton.system, place)
-        ended = stage.newton.solve(stage.enter(guess), places.name, row)
-        state, comm = stage.leave(ended.state), self.scene.comm
-        apart = max_abs(comm, high.u - low.u)
-        if not ended.converged or max_abs(comm, state.u - guess.u) > apart + SLACK * self.scene.model.system.length:
-            raise Lost(f"no equilibrium is found at {places.column} = {place:.6g}: {ended.reason}")
+        low, high = ((values[i], way[i].point.state) for i in (k, k + 1))
+        state = self._between_states(stage_of(self.scene, places.step, low[1]), low, high, place)
         point = Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0)
         return Record("target", places.name, point, step=places.step.number)
+
+    def _between_states(self, stage: Stage, low: Placed, high: Placed, place: float, tries: int = TRIES) -> State:
+        """The equilibrium at a place between two; where Newton's method fails, first one halfway to the nearer."""
+        (first, a), (last, b) = low, high
+        part = float(np.clip((place - first) / ((last - first) or 1.0), 0.0, 1.0))
+        mu = {name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()}
+        guess = self.scene.model.system.placed(State((1 - part) * a.u + part * b.u, mu))
+        row = self.places.row(stage.newton.system, place)
+        ended = stage.newton.solve(stage.enter(guess), self.places.name, row)
+        state, comm = stage.leave(ended.state), self.scene.comm
+        apart = max_abs(comm, b.u - a.u) + SLACK * self.scene.model.system.length
+        if ended.converged and max_abs(comm, state.u - guess.u) <= apart:
+            return state
+        if not tries:
+            raise Lost(f"no equilibrium is found at {self.places.column} = {place:.6g}: {ended.reason}")
+        half = (place + (first if part < 0.5 else last)) / 2
+        middle = half, self._between_states(stage, low, high, half, tries - 1)
+        ends = (middle, high) if part < 0.5 else (low, middle)
+        return self._between_states(stage, *ends, place, tries - 1)
 
     @staticmethod
     def _between(low: float, high: float, place: float, slack: float) -> bool:

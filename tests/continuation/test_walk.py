@@ -34,6 +34,7 @@ def test_all_events_of_the_path_are_located(first: float, largest: float) -> Non
     path = walked(Goal("target", [4.0], "conjugate"), first, largest)
     events = [(label, point) for label, point in path if label in ("fold", "bifurcation")]
     assert [label for label, _ in events] == ["fold", "fold", "bifurcation"]
+    assert [point.negative_pivots for _, point in events[:2]] == [0, 1]  # as before each
     for (_, point), x in zip(events, (*FOLDS, C), strict=True):
         assert point.state.mu["load"] == pytest.approx(f(x), rel=1e-8)
         assert point.state.u[1] == pytest.approx(x, abs=1e-4)

@@ -67,7 +67,8 @@ def test_sources_that_move() -> None:
 
 def agrees(turned: tuple[ms.Scene, Any], standing: tuple[ms.Scene, Any]) -> None:
     (one, state), (other, wanted) = turned, standing
-    assert state.u == pytest.approx(wanted.u, abs=1e-7 * np.abs(wanted.u).max())
+    near = max(1e-7 * np.abs(wanted.u).max(), 1e-12)  # a point's tolerance is 1e-9 h, and one of these moves by 1e-6 h
+    assert state.u == pytest.approx(wanted.u, abs=near)
     flat = one.observe(State(one.model.zero(), state.mu))  # the undeformed shell in the field as it is now
     here, there = one.observe(state), other.observe(wanted)
     assert here["lambda_m"] == pytest.approx(there["lambda_m"], rel=1e-12)

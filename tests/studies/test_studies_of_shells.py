@@ -35,7 +35,8 @@ def one(**shell: Any) -> dict[str, Any]:
 def two(**keys: Any) -> dict[str, Any]:
     """Caps one above the other: the lower one has an imperfection, the upper one is thicker."""
     upper = one(thickness="0.8 mm") | {"place": {"position": [0, 0, "10 mm"]}}
-    return {"shells": {"lower": one(**FLAW), "upper": upper}, "mesh": MESH, "loading": LOAD} | keys
+    shells = {"lower": one(**FLAW), "upper": upper}
+    return {"shells": shells, "mesh": MESH, "loading": LOAD, "symmetry": "half"} | keys
 
 
 def alone(loading: dict[str, Any] = LOAD, **shell: Any) -> float:
