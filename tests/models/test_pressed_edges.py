@@ -88,6 +88,29 @@ def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
     assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-5)
 
 
+def test_a_corner(tmp_path: Path) -> None:
+    """A strip turned in its plane onto a corner, as a rigid body: the corner is as deep as it is, 0.01 h times the
+    slope, and differences are as those of an edge.
+    """
+    scene = Scene(Case.model_validate(standing(tmp_path, STEEP)))
+    model, (term,), mu = scene.model, scene.model.touchings, scene.unloaded().mu
+    system, rng = model.system, np.random.default_rng(3)
+    r, deep, tilt = model.r0.x.array.reshape(-1, 3), 0.1 * h, np.radians(30)
+    along, up = np.array([0, 1.0, 0]), np.array([np.cos(STEEP), 0, np.sin(STEEP)])
+    of_strip, off = r[:, 2] > 0, r - [0, 0, (1 + GAP) * h]
+    u = np.zeros_like(r)
+    for way, to in ((along, np.cos(tilt) * along + np.sin(tilt) * up), (up, np.cos(tilt) * up - np.sin(tilt) * along)):
+        u[of_strip] += np.outer(off[of_strip] @ way, to - way)
+    u[of_strip, 2] -= GAP * h + deep
+    assert (r + u)[of_strip, 2].min() == pytest.approx(h - deep)
+    u, v = u.ravel()[: system.size], 1e-8 * h * rng.standard_normal(system.size)
+    at = system.at(State(u, mu))
+    assert at.of(term.penetration) == pytest.approx(deep, abs=0.015 * h * np.sin(tilt))
+    Kv = times([(1.0, at.of(term.entries))], v)
+    low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
+    assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+
+
 @pytest.mark.slow
 def test_a_steep_edge(tmp_path: Path) -> None:
     """The strip's ends sink in by less than the bound; force and sliding are those of the beam, 2e-3.

@@ -170,7 +170,8 @@ class InteractionTerm:
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
         """By the nodes of own cells: a placement moves charges as a displacement does; collective."""
         V, count = self._u.function_space, len(self._cells.own)
-        of_nodes = energy * self._evaluated()[1] + force * _product(self.acting(), whole(direction).ravel())
+        D, v = self.acting(), whole(direction).ravel()
+        of_nodes = energy * self._evaluated()[1] + force * (D.stored @ v + D.times_others(v[:, None]).ravel())
         nodes = V.dofmap.list[:count]
         shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
         return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])

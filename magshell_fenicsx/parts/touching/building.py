@@ -102,7 +102,7 @@ def touchings(
         powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if keeps_volume.any() else None
-    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree))
+    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h)
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)

@@ -282,6 +282,8 @@ class Facing:
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         along = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
         on_edge = along & (on_side & (self._cells.across[nearest.cell] < 0)).any(axis=1)
+        in_corner = on_side.sum(axis=1) == 2  # where an edge goes on from one cell to another, or turns
+        on_edge |= in_corner & (~on_side & self._cells.on_edge[nearest.cell]).any(axis=1)
         level = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
         left = on_edge & (level < STEEP) & ~points.on_edge[nearest.point]
         return np.asarray(np.repeat(left, np.diff([*first, len(at.point)])))

@@ -14,7 +14,7 @@ need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 
 import basix
 import numpy as np
@@ -31,6 +31,9 @@ LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
 SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
 CLOSE = 1e-9  # between corners that are one
 BEFORE = 1e-5  # of the height of a cell: how far the points of its edge are inside
+CORNER = 0.01  # of the thickness: how far a corner's point is before it, or cells that meet opposite would share it
+INSIDE = -1  # a triangle that is not on an edge
+TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that have points
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
 FINE = 60  # parts of a side, at whose ends the distance from a rule's points is measured
@@ -88,7 +91,7 @@ class Triangles:
     first, e1, e2
         (n, 2) a corner, and the sides from there.
     ends
-        (n,) whether the third side is on an edge of the surface.
+        (n,) `INSIDE`, or where the edge turns at the third side, which is on it: see `ending_rule`.
     """
 
     cell: Longs
@@ -96,7 +99,7 @@ class Triangles:
     first: Array
     e1: Array
     e2: Array
-    ends: Inside
+    ends: Longs
 
     @property
     def size(self) -> Array:
@@ -149,33 +152,33 @@ class Pieces:
         cell, faces = ([getattr(self, name), getattr(other, name)] for name in ("cell", "faces"))
         return Pieces(np.concatenate(cell), np.concatenate(faces), np.concatenate(corners))
 
-    def triangles(self, open_sides: Inside) -> Triangles:
+    def triangles(self, open_sides: Inside, turns: Inside) -> Triangles:
         """Those of the centroids and each side; a triangle with one side on an edge of the surface, or none, is one by
         itself. So they do not depend on which corner is the first.
 
         Parameters
         ----------
-        open_sides
-            (cells, 3) whether the side opposite to each corner is on an edge.
+        open_sides, turns
+            (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge turns in the corner.
         """
         c, after = self.corners, np.roll(self.corners, -1, axis=1)
         apart = np.linalg.norm(c - after, axis=2) > CLOSE
         on = np.abs(np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)) < CLOSE
-        ends = np.asarray(apart & (on & np.roll(on, -1, axis=1) & open_sides[self.cell][:, None]).any(axis=2))
-        whole = (apart.sum(axis=1) == 3) & (ends.sum(axis=1) <= 1)
+        along = apart & (on & np.roll(on, -1, axis=1) & open_sides[self.cell][:, None]).any(axis=2)
+        turned = (on[..., [1, 2, 0]] & on[..., [2, 0, 1]] & turns[self.cell][:, None]).any(axis=2)
+        ends = np.where(along, turned + 2 * np.roll(turned, -1, axis=1), INSIDE)
+        whole = (apart.sum(axis=1) == 3) & (along.sum(axis=1) <= 1)
         middle = np.zeros((len(c), 2))
         middle[~whole] = centroid(c[~whole])
         n, k = np.nonzero(apart & ~whole[:, None])
         sides = c[n, k] - middle[n], after[n, k] - middle[n]
-        fans = Triangles(self.cell[n], self.faces[n], middle[n], *sides, np.asarray(ends[n, k]))
+        fans = Triangles(self.cell[n], self.faces[n], middle[n], *sides, ends[n, k])
         own = np.argsort(~apart[whole], axis=1, kind="stable")[:, :3]
         three = np.take_along_axis(c[whole], own[..., None], axis=1)
         at_end = np.take_along_axis(ends[whole], own, axis=1)
-        apex = np.where(at_end.any(axis=1), (at_end.argmax(axis=1) + 2) % 3, 0)[:, None]
+        apex = np.where((at_end != INSIDE).any(axis=1), (at_end.argmax(axis=1) + 2) % 3, 0)[:, None]
         first, a, b = (np.take_along_axis(three, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3))
-        alone = Triangles(
-            self.cell[whole], self.faces[whole], first, a - first, b - first, np.asarray(at_end.any(axis=1))
-        )
+        alone = Triangles(self.cell[whole], self.faces[whole], first, a - first, b - first, at_end.max(axis=1))
         both = [np.concatenate([getattr(part, each.name) for part in (alone, fans)]) for each in fields(Triangles)]
         return Triangles(*both)
 
@@ -210,26 +213,37 @@ def inner_rule(degree: int) -> tuple[Array, Array]:
     return basix.make_quadrature(basix.CellType.triangle, degree)  # type: ignore[no-any-return]
 
 
-def ending_rule(degree: int) -> tuple[Array, Array]:
+@cache
+def ending_rule(degree: int, turns: int = 0, corner: float = 0.0) -> tuple[Array, Array]:
     """The same with points beside the side opposite to the first corner, so that an edge there has points.
 
     On lines from that corner the points are Radau's, for the weight of their distance from it, with one `BEFORE` the
     side: an edge often lies exactly opposite another one, where the second derivative of the gap jumps. Along the side
-    they are Gauss's, so that none is opposite a corner, where several cells meet. G. H. Golub, SIAM Review 15 (1973).
+    they are Gauss's, so that none is opposite a corner, where several cells meet. Where the edge turns, at the begin
+    of the side if `turns` is 1, at the end if 2, at both if 3, one on it is a part `corner` of the side before that.
     """
-    n = (degree + 1) // 2
-    k, last = np.arange(n + 1), 1 - 2 * BEFORE
-    a, b = 1 / ((2.0 * k + 1) * (2 * k + 3)), k * (k + 1) / (2.0 * k + 1) ** 2
-    before, there = 0.0, 1.0  # the polynomials at the last point
-    for i in range(n):
-        before, there = there, (last - a[i]) * there - b[i] * before
-    a[n] = last - b[n] * before / there
-    x, vectors = scipy.linalg.eigh_tridiagonal(a, np.sqrt(b[1:]))
-    t, by_t = (1 + x) / 2, vectors[0] ** 2 / 2
-    x, by_s = scipy.special.roots_legendre(degree // 2 + 1)
-    s = (1 + x) / 2
-    X = np.stack([np.outer(t, 1 - s), np.outer(t, s)], axis=-1)
-    return X.reshape(-1, 2), np.outer(by_t, by_s / 2).ravel()
+    t, by_t = _with_points((degree + 1) // 2, [1 - BEFORE], 1)
+    given = [at for at, there in ((corner, 1), (1 - corner, 2)) if turns & there]
+    inside, on_side = (_with_points((degree + 2 - len(at)) // 2, at, 0) for at in ([], given))
+    sides = [inside] * (len(t) - 1) + [on_side]
+    X = [np.stack([at * (1 - s), at * s], axis=1) for at, (s, _) in zip(t, sides, strict=True)]
+    return np.concatenate(X), np.concatenate([by * by_s for by, (_, by_s) in zip(by_t, sides, strict=True)])
+
+
+def _with_points(count: int, given: Sequence[float], power: int) -> tuple[Array, Array]:
+    """Points from 0 to 1 and weights for the weight x^power, of highest degree with `count` points beside given ones.
+
+    Those are the roots of a polynomial that is orthogonal to all lower ones, in Legendre's, by the weight times what is
+    zero at the given ones. G. H. Golub, SIAM Review 15 (1973) 318-334.
+    """
+    x, w = scipy.special.roots_legendre(2 * count + 4)
+    legendre, number = np.polynomial.legendre.legvander, count + len(given)
+    weight = w / 2 * ((1 + x) / 2) ** power
+    P, signed = legendre(x, count - 1), weight * np.prod([(1 + x) / 2 - at for at in given], axis=0)
+    signed = np.sign(signed.sum()) * signed[:, None] * P
+    free = scipy.linalg.eigh(P.T @ (x[:, None] * signed), P.T @ signed, eigvals_only=True)
+    points = np.sort([*((1 + free) / 2), *given])
+    return points, np.linalg.solve(legendre(2 * points - 1, number - 1).T, legendre(x, number - 1).T @ weight)
 
 
 def covers(X: Array) -> float:
@@ -259,6 +273,8 @@ class Segments:
         (nodes, 3) undeformed.
     degrees
         Of the rule on whole cells and on large parts, and on small parts.
+    h
+        Thickness over R.
 
     Attributes
     ----------
@@ -268,13 +284,13 @@ class Segments:
         (cells,): no place of a cell is farther from all points of the rule.
     """
 
-    def __init__(self, cells: Cells, own: Longs, r0: Array, degrees: tuple[int, int]) -> None:
+    def __init__(self, cells: Cells, own: Longs, r0: Array, degrees: tuple[int, int], h: float) -> None:
         self._cells, self._r0 = cells, r0
-        self._rules = [(inner_rule(degree), ending_rule(degree)) for degree in degrees]
+        self._degrees, self._turns, self._before = degrees, cells.turns(r0, TURN), CORNER * h
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        far = [covers(X) for X, _ in self._rules[0]]
-        self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(far), far[0])
+        inside, at_edge = covers(inner_rule(degrees[0])[0]), covers(ending_rule(degrees[0])[0])
+        self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(inside, at_edge), inside)
         self.rule = Points.joined(self._on(Pieces.cells(own)))
 
     def points(self, near: Places, r: Array) -> Points:
@@ -299,11 +315,17 @@ class Segments:
 
     def _on(self, pieces: Pieces) -> list[Points]:
         """The points on pieces, by the triangles that they are cut into."""
-        made, triangles = list[Points](), pieces.triangles(self._cells.across < 0)
-        for large, of_size in ((True, self._rules[0]), (False, self._rules[1])):
-            for ends, (X, weights) in ((False, of_size[0]), (True, of_size[1])):
-                these = (triangles.size > NOTHING) & ((triangles.size > 2 * LARGE) == large) & (triangles.ends == ends)
-                made.append(self._by_rule(triangles.of(these), X, weights))
+        triangles = pieces.triangles(self._cells.across < 0, self._turns)
+        triangles = triangles.of(triangles.size > NOTHING)
+        c, along = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
+        side = np.linalg.norm(np.einsum("na,nai->ni", along, c[:, 1:] - c[:, :1]), axis=1)
+        corner = np.minimum(np.exp2(np.round(np.log2(self._before / side))), 1 / 64)  # of few values, so of few rules
+        kind = np.stack([triangles.size <= 2 * LARGE, triangles.ends, np.where(triangles.ends > 0, corner, 0)], axis=1)
+        made, (kinds, number) = list[Points](), np.unique(kind, axis=0, return_inverse=True)
+        for k, (small, ends, part) in enumerate(kinds):
+            degree = self._degrees[int(small)]
+            rule = inner_rule(degree) if ends == INSIDE else ending_rule(degree, int(ends), float(part))
+            made.append(self._by_rule(triangles.of(number.ravel() == k), *rule))
         return made
 
     def _by_rule(self, triangles: Triangles, X: Array, weights: Array) -> Points:
@@ -312,7 +334,7 @@ class Segments:
         table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         weight = np.outer(triangles.size, weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
-        on_edge = np.outer(triangles.ends, X.sum(axis=1) > 1 - 2 * BEFORE).ravel()
+        on_edge = np.outer(triangles.ends != INSIDE, X.sum(axis=1) > 1 - 2 * BEFORE).ravel()
         return Points(cell, table[0], weight, faces, on_edge)
 
     def normals(self, r: Array) -> Array:
