@@ -19,8 +19,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path as EquilibriumPath
-from magshell_fenicsx.continuation.path import StepOptions
-from magshell_fenicsx.continuation.point import PathStopped
+from magshell_fenicsx.continuation.point import PathStopped, StepOptions
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.shapes import StripShape

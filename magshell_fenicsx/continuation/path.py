@@ -10,7 +10,15 @@ import numpy as np
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.continuation.interpolated import flat_beyond, hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
-from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
+from magshell_fenicsx.continuation.point import (
+    Journal,
+    NoJournal,
+    NoProgress,
+    PathStopped,
+    Point,
+    Progress,
+    StepOptions,
+)
 from magshell_fenicsx.continuation.snes import FAR, HIDDEN
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
@@ -31,38 +39,6 @@ NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody cou
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
 ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
-
-
-@dataclass(frozen=True)
-class StepOptions:
-    """Adaptive step length.
-
-    Attributes
-    ----------
-    first, largest, smallest
-        Step lengths in units of s.
-    easy, hard
-        A step grows after at most `easy` factorisations, and shrinks after at least `hard`.
-    few
-        A step also grows after at most so many iterations.
-    straight
-        A step grows only if the cosine between the tangents of successive points is larger.
-    turn
-        Least cosine between the tangents of successive points. A sharper turn counts as a jump to another
-        branch, and a smaller step is tried.
-    gap
-        Largest part of a step that the tangents at its ends may leave unexplained. A larger one counts as a jump too.
-    """
-
-    first: float
-    largest: float
-    smallest: float
-    easy: int = 2
-    hard: int = 4
-    few: int = 4
-    straight: float = 0.9
-    turn: float = 0.5
-    gap: float = 0.1
 
 
 @dataclass

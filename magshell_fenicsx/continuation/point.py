@@ -137,3 +137,35 @@ class NoProgress:
 
     def doing(self, what: str) -> None:
         pass
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Adaptive step length.
+
+    Attributes
+    ----------
+    first, largest, smallest
+        Step lengths in units of s.
+    easy, hard
+        A step grows after at most `easy` factorisations, and shrinks after at least `hard`.
+    few
+        A step also grows after at most so many iterations.
+    straight
+        A step grows only if the cosine between the tangents of successive points is larger.
+    turn
+        Least cosine between the tangents of successive points. A sharper turn counts as a jump to another
+        branch, and a smaller step is tried.
+    gap
+        Largest part of a step that the tangents at its ends may leave unexplained. A larger one counts as a jump too.
+    """
+
+    first: float
+    largest: float
+    smallest: float
+    easy: int = 2
+    hard: int = 4
+    few: int = 4
+    straight: float = 0.9
+    turn: float = 0.5
+    gap: float = 0.1

@@ -30,8 +30,8 @@ from magshell_fenicsx.continuation.control import Bordered, GivenConjugate, Metr
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
     State,

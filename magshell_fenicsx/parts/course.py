@@ -11,7 +11,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.quantities.quantity import VOLUME
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.continuation.point import StepOptions
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import Step
 

@@ -22,7 +22,8 @@ from magshell_fenicsx.assembly.coupled import with_entries
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
-from magshell_fenicsx.continuation.factor import Banded, Factorisation
+from magshell_fenicsx.continuation.banded import Banded
+from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models import carriers

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, branching, find_bifurcation
 from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair, critical_mode
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.input.source import CaseError

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.path import StepOptions
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.search import Limits, Settling, further
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.course import SearchSection

@@ -6,8 +6,8 @@ from functools import partial
 
 from magshell_fenicsx.continuation.device import Along, Curve, Device, Held, natural_scale
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Control, Path, StepOptions
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.path import Control, Path
+from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.onset import way_to_touch
 from magshell_fenicsx.simulate.record import Stopped

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from magshell_fenicsx.continuation.device import Conjugate
-from magshell_fenicsx.continuation.path import StepOptions
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
 from magshell_fenicsx.parts.bodies.press import finer as along_contact

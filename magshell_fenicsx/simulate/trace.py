@@ -13,7 +13,8 @@ from typing import Any, cast
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.path import SEEN, Control, Quantity, StepOptions
+from magshell_fenicsx.continuation.path import SEEN, Control, Quantity
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Until
 from magshell_fenicsx.input.section import in_units

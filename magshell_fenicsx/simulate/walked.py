@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import Branching, branching
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing

@@ -10,7 +10,8 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.evaluated import Noise
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, Weighted
 from magshell_fenicsx.continuation.walk import instabilities
 

@@ -20,7 +20,8 @@ from magshell_fenicsx.continuation.device import Device, natural_scale
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, Weighted
 from magshell_fenicsx.continuation.walk import Goal, Walk
 

@@ -9,7 +9,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation import factor
-from magshell_fenicsx.continuation.factor import Banded, Factorisation
+from magshell_fenicsx.continuation.banded import Banded
+from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Skewed
 
 

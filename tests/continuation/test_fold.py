@@ -8,8 +8,8 @@ from continuation.toys import Toy, pitchfork, snap_back, snap_through
 
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, fold_ahead, predict_fold, sensitivity
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State
 
 FOLD = 1 - 1 / np.sqrt(3)  # of load = x^3 - 3 x^2 + 2 x

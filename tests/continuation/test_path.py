@@ -12,8 +12,8 @@ from scipy.interpolate import KroghInterpolator
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
 from magshell_fenicsx.continuation.interpolated import hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Control, Path, StepOptions
-from magshell_fenicsx.continuation.point import NoProgress, PathStopped, Point
+from magshell_fenicsx.continuation.path import Control, Path
+from magshell_fenicsx.continuation.point import NoProgress, PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import instabilities
 

@@ -6,8 +6,8 @@ from continuation.toys import closed_loop, pitchfork, snap_back
 
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Label, Walk
 

@@ -11,8 +11,8 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Control, Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped
+from magshell_fenicsx.continuation.path import Control, Path
+from magshell_fenicsx.continuation.point import PathStopped, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing, Watch

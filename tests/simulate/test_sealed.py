@@ -14,7 +14,8 @@ import json, sys
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
 from magshell_fenicsx.continuation.device import Device, natural_scale
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 
 settings = ["symmetry=none", "mesh.degree=2", "mesh.refinement=0.4"]
 case = ms.Case.load(sys.argv[1], settings)

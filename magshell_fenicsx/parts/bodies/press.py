@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.continuation.point import StepOptions
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
 

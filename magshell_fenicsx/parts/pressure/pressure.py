@@ -22,7 +22,7 @@ BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
-    from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.continuation.point import StepOptions
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
 

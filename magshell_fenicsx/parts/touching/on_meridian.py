@@ -10,7 +10,7 @@ C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without wave
 rule on each cell. At a free end one is next to the end, which an edge stands on.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from zlib import crc32
 
@@ -430,8 +430,7 @@ def _rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     """Points and weights on [0, 1]: Gauss's, or Radau's and Lobatto's with points next to ends."""
     from scipy.special import roots_jacobi  # takes long to import
 
-    inner: Callable[..., tuple[Array, Array]] = roots_jacobi
-    x, w = inner(count - begins - ends, float(ends), float(begins))
+    x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
     w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
     end = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
     x = np.concatenate([[-1 + 2 * BEFORE] * begins, x, [1 - 2 * BEFORE] * ends])

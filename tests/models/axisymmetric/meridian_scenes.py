@@ -6,8 +6,8 @@ import numpy as np
 from conftest import spherical
 
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Instability, instabilities
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian

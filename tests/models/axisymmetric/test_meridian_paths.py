@@ -11,7 +11,8 @@ from meridian_scenes import POLE_FORCE, buckle, dimpled, hemisphere, indent, unl
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.mesh.shapes import flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 

@@ -8,7 +8,8 @@ from scipy.integrate import solve_bvp
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
