@@ -260,7 +260,10 @@ class Factorisation:
         X = B.duplicate()
         with self.solving:
             self._pc.matApply(B, X)
-            return np.array(X.getDenseArray())
+        solutions = np.array(X.getDenseArray())
+        B.destroy()
+        X.destroy()
+        return solutions
 
 
 def has_cholmod() -> bool:

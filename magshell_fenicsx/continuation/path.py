@@ -256,7 +256,7 @@ class Path:
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
                 if isinstance(tried, str) and part < 1:
-                    vain = here
+                    vain, far = here, None
                     continue
                 if isinstance(tried, str):
                     leaps += 1
@@ -394,9 +394,9 @@ class Path:
     def _solve(
         self, row: Row, s: float, guess: State, stress: Sequence[Weighted], near: State | None, most: float
     ) -> Point | str:
-        before = self.newton.factorisation.count
         if near:
             self.newton.stand_at(near)
+        before = self.newton.factorisation.count
         old = NEAR if near else 0.0  # a tangent of the path must not depend on what was factored before its point
         outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=old, most=most)
         if not outcome.converged:

@@ -271,7 +271,7 @@ class Linearised:
         return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
 
     def misled(self) -> bool:
-        """Whether the last step had foreseen forces and is much shorter with computed ones, or had computed ones."""
+        """Whether the last step is much shorter with computed forces than with foreseen ones; also if nobody knows."""
         if not (self._foreseen and self._state and self._chord and self.matrix):
             return True  # nothing is known of it
         state, before = self._state, self._iterates.steps[-1].size

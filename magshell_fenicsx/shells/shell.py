@@ -257,7 +257,7 @@ class ShellModel(Thin):
             of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
             thick = carrier.contact_rule, factor, factory.law_of_cells.thins
             surfaces = self.r0, self.u, midsurface.patches
-            meeting = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape)
+            meeting = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape, self.planes)
             terms += meeting
         self.touchings = meeting
         if loads.joints or midsurface.feet:

@@ -13,7 +13,7 @@ from magshell_fenicsx.parts.touching.touching import NEARER, Touching
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
-DEEP = 2e-3  # of the thickness: how far past the first contact the guess of a step leads
+DEEP = 2e-3  # of the thickness: how far past the first contact the guess of a step leads; as for bodies
 MOST = 40  # looks at a way
 
 

@@ -278,7 +278,10 @@ class Read:
             why = f" ({self._lost})" if self._lost else ""
             raise Outside(f"{places.column} = {place:.6g} is outside the path, which {reached}{why}")
         low, high = ((values[i], way[i].point.state) for i in (k, k + 1))
-        state = self._between_states(stage_of(self.scene, places.step, low[1]), low, high, place)
+        try:
+            state = self._between_states(stage_of(self.scene, places.step, low[1]), low, high, place)
+        except Lost as e:
+            raise Lost(f"no equilibrium is found at {places.column} = {place:.6g}: {e}") from None
         point = Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0)
         return Record("target", places.name, point, step=places.step.number)
 
@@ -295,7 +298,7 @@ class Read:
         if ended.converged and max_abs(comm, state.u - guess.u) <= apart:
             return state
         if not tries:
-            raise Lost(f"no equilibrium is found at {self.places.column} = {place:.6g}: {ended.reason}")
+            raise Lost("the iteration has left the path" if ended.converged else ended.reason)
         half = (place + (first if part < 0.5 else last)) / 2
         middle = half, self._between_states(stage, low, high, half, tries - 1)
         ends = (middle, high) if part < 0.5 else (low, middle)

@@ -27,6 +27,7 @@ NEAR = 1e-7  # of h: a smaller gap is none
 FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
+NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
@@ -76,7 +77,7 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
             raised[contact.setting] = STIFFER * k
     for pair, deep in between(stage.scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
-        if deep > pair.bound * h and k < AT_A_CORNER * pair.stiffness:
+        if deep > NEARLY * pair.bound * h and k < AT_A_CORNER * pair.stiffness:
             raised[pair.setting] = STIFFER * k
     return State(low.state.u, {**low.state.mu, **raised}) if raised else None
 

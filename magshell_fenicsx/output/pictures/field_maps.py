@@ -18,6 +18,7 @@ from magshell_fenicsx.problem.wanted import OutputSection
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.path import Path as MatplotlibPath
 
 Array = NDArray[np.float64]
 MOST = 6  # maps in the picture
@@ -99,6 +100,7 @@ def section(surface: Surface, grid: Grid) -> Array:
 def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: Mapping[str, Any]) -> None:
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.patches import PathPatch
 
     size_of_unit, unit = unit_of(case)
     length = 1.0 if isnan(R) else 1e3 * R
@@ -126,8 +128,11 @@ def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: 
     if not wide:
         bar.ax.xaxis.set_major_formatter(number_format())
     flat = length * np.stack([lines @ e for e in units], axis=-1)
-    drawn = outlines(flat) if surface.is_body else list(_thickened(flat, length * h))
-    axes.add_collection(PolyCollection(drawn, color="0.15", linewidth=LINE_WIDTH), autolim=False)
+    if surface.is_body:
+        axes.add_patch(PathPatch(with_holes(outlines(flat)), color="0.15", linewidth=LINE_WIDTH))
+    else:
+        drawn = list(_thickened(flat, length * h))
+        axes.add_collection(PolyCollection(drawn, color="0.15", linewidth=LINE_WIDTH), autolim=False)
 
 
 def _thickened(lines: Array, h: float) -> Array:
@@ -161,6 +166,19 @@ def outlines(lines: Array) -> list[Array]:
             end = following ^ 1  # the other end of that line
         polygons.append(np.array(polygon))
     return polygons
+
+
+def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
+    """The area between polygons (n, 2): those within an odd number of others are holes."""
+    from matplotlib.path import Path as MatplotlibPath
+
+    paths = [MatplotlibPath(np.append(each, each[:1], axis=0), closed=True) for each in polygons]
+    turned = list[MatplotlibPath]()
+    for path, (x, y) in zip(paths, (each.T for each in polygons), strict=True):
+        hole = sum(other is not path and other.contains_point((x[0], y[0])) for other in paths) % 2
+        right = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0
+        turned.append(MatplotlibPath(np.asarray(path.vertices)[::-1], path.codes) if right != hole else path)
+    return MatplotlibPath.make_compound_path(*turned)
 
 
 def masked(values: Array) -> Any:

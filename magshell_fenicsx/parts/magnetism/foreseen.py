@@ -67,7 +67,7 @@ class Foreseen:
 
     def at(self, u: Array, D: ActingOnEachOther, of_D: Array) -> Array | None:
         """This rank's part of the forces, from those of D at its state; None if nothing is known."""
-        if not self._points:
+        if not (self._points and np.isfinite(u).all()):
             return None
         if D is not self._D or self._begins(u):
             self._turn(u, D, of_D)
@@ -141,7 +141,7 @@ class Along:
     def through(cls, points: list[list[Known]]) -> "Along":
         """Through the last states of points, of which the last is the newest."""
         base, before = points[-1][-1], points[-2][-1] if len(points) > 1 else None
-        if before is None:
+        if before is None or np.array_equal(before.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
         direction, way = base.u - before.u, float(np.linalg.norm(base.u - before.u))
         direction = np.asarray(direction / way)

@@ -37,8 +37,9 @@ LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
 def polar(F: Array) -> Array:
-    """The rotations nearest to matrices (n, 3, 3) with positive determinants."""
+    """The rotations nearest to matrices (n, 3, 3)."""
     U, _, V = np.linalg.svd(F)
+    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]  # a reflection where an iterate has turned a cell inside out
     return np.asarray(U @ V)
 
 
@@ -229,12 +230,8 @@ class InteractionTerm:
         if factor is not None:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff, self._foreseen = (
-                given,
-                None,
-                None,
-                Foreseen(self._blocks, self._turns),
-            )
+            self._given, self._seen, self._stiff = given, None, None
+            self._foreseen = Foreseen(self._blocks, self._turns)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])
@@ -242,7 +239,7 @@ class InteractionTerm:
     def _turns(self, u: Array, before: Array) -> Array:
         """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar last."""
         r0, nodes = whole(self._model.r0), self._cells.nodes
-        element = self._all()[0].element
+        element = self._u.function_space.element.basix_element
         T = element.tabulate(1, element.points)[1:, :, :, 0]
 
         def frames(u: Array) -> Array:

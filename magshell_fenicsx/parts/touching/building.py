@@ -8,7 +8,7 @@ from dolfinx import fem, mesh
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
-from magshell_fenicsx.mesh.mirror import Image
+from magshell_fenicsx.mesh.mirror import Image, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import Grown
 from magshell_fenicsx.parts.touching.faces import Faces
@@ -35,6 +35,7 @@ def touchings(
     images: Sequence[Image] = (),
     on_planes: Sequence[NDArray[np.int32]] = (),
     natural: Grown | None = None,
+    planes: Sequence[Mirror] = (),
 ) -> list[Touching]:
     """The contacts of pairs; collective.
 
@@ -56,6 +57,8 @@ def touchings(
         The sides of this rank's cells on their planes.
     natural
         The natural shape; None if it is the drawn one.
+    planes
+        Of symmetry.
 
     Raises
     ------
@@ -102,7 +105,7 @@ def touchings(
         powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if keeps_volume.any() else None
-    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h)
+    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h, planes)
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)

@@ -76,25 +76,21 @@ class Cells:
     @cached_property
     def on_edge(self) -> NDArray[np.bool_]:
         """(cells, 3): whether each corner is on an edge of the surface."""
-        there = np.zeros(self.corners.max() + 1, dtype=bool)
-        there[self._open_sides] = True
-        return np.asarray(there[self.corners])
-
-    @property
-    def _open_sides(self) -> Longs:
-        """Vertices (n, 2) of sides on an edge."""
         cell, side = np.nonzero(self.across < 0)
-        return np.stack([self.corners[cell, (side + 1) % 3], self.corners[cell, (side + 2) % 3]], axis=1)
+        there = np.zeros(self.corners.max() + 1, dtype=bool)
+        there[self.corners[cell, (side + 1) % 3]] = there[self.corners[cell, (side + 2) % 3]] = True
+        return np.asarray(there[self.corners])
 
     def turns(self, r0: Array, cosine: float) -> NDArray[np.bool_]:
         """(cells, 3): whether an edge of the undeformed surface turns at each corner, by more than an angle."""
-        x, ends = np.zeros((int(self.corners.max()) + 1, 3)), self._open_sides
-        x[self.corners] = self.at_corners @ r0[self.nodes]
-        way = x[ends[:, 1]] - x[ends[:, 0]]
-        way /= np.linalg.norm(way, axis=1)[:, None]
-        onward = np.zeros_like(x)  # of an even edge the two ways from a vertex cancel
-        np.add.at(onward, ends[:, 0], way)
-        np.add.at(onward, ends[:, 1], -way)
+        cell, side = np.nonzero(self.across < 0)
+        D = self.element.tabulate(1, CORNERS)[1:, :, :, 0]
+        onward = np.zeros((int(self.corners.max()) + 1, 3))  # of an even edge the two ways from a vertex cancel
+        along = CORNERS[(side + 2) % 3] - CORNERS[(side + 1) % 3]
+        for corner, sign in (((side + 1) % 3, 1.0), ((side + 2) % 3, -1.0)):
+            way = np.einsum("kd,dkn,kni->ki", along, D[:, corner], r0[self.nodes[cell]])
+            way /= np.linalg.norm(way, axis=1)[:, None]
+            np.add.at(onward, self.corners[cell, corner], sign * way)
         turned = np.linalg.norm(onward, axis=1) > np.sqrt(2 * (1 - cosine))
         return np.asarray(turned[self.corners])
 

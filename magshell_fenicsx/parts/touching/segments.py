@@ -14,14 +14,14 @@ need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cached_property
 
-import basix
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.touching.nearest import BULGE, CORNERS, Cells, Longs, Places
+from magshell_fenicsx.parts.touching.rules import BEFORE, covers, ending_rule, inner_rule
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
@@ -30,13 +30,11 @@ NOTHING = 1e-12  # an area in it that is none
 LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
 SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
 CLOSE = 1e-9  # between corners that are one
-BEFORE = 1e-5  # of the height of a cell: how far the points of its edge are inside
 CORNER = 0.01  # of the thickness: how far a corner's point is before it, or cells that meet opposite would share it
 INSIDE = -1  # a triangle that is not on an edge
 TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that have points
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
-FINE = 60  # parts of a side, at whose ends the distance from a rule's points is measured
 DIGITS = 6  # bytes of the number of a state: a float has all of them
 
 
@@ -208,51 +206,6 @@ def area(corners: Array) -> Array:
     return np.asarray(np.sum(x * np.roll(y, -1, 1) - np.roll(x, -1, 1) * y, axis=1) / 2)
 
 
-def inner_rule(degree: int) -> tuple[Array, Array]:
-    """Points in the reference triangle and weights, exact for polynomials of this degree."""
-    return basix.make_quadrature(basix.CellType.triangle, degree)  # type: ignore[no-any-return]
-
-
-@cache
-def ending_rule(degree: int, turns: int = 0, corner: float = 0.0) -> tuple[Array, Array]:
-    """The same with points beside the side opposite to the first corner, so that an edge there has points.
-
-    On lines from that corner the points are Radau's, for the weight of their distance from it, with one `BEFORE` the
-    side: an edge often lies exactly opposite another one, where the second derivative of the gap jumps. Along the side
-    they are Gauss's, so that none is opposite a corner, where several cells meet. Where the edge turns, at the begin
-    of the side if `turns` is 1, at the end if 2, at both if 3, one on it is a part `corner` of the side before that.
-    """
-    t, by_t = _with_points((degree + 1) // 2, [1 - BEFORE], 1)
-    given = [at for at, there in ((corner, 1), (1 - corner, 2)) if turns & there]
-    inside, on_side = (_with_points((degree + 2 - len(at)) // 2, at, 0) for at in ([], given))
-    sides = [inside] * (len(t) - 1) + [on_side]
-    X = [np.stack([at * (1 - s), at * s], axis=1) for at, (s, _) in zip(t, sides, strict=True)]
-    return np.concatenate(X), np.concatenate([by * by_s for by, (_, by_s) in zip(by_t, sides, strict=True)])
-
-
-def _with_points(count: int, given: Sequence[float], power: int) -> tuple[Array, Array]:
-    """Points from 0 to 1 and weights for the weight x^power, of highest degree with `count` points beside given ones.
-
-    Those are the roots of a polynomial that is orthogonal to all lower ones, in Legendre's, by the weight times what is
-    zero at the given ones. G. H. Golub, SIAM Review 15 (1973) 318-334.
-    """
-    x, w = scipy.special.roots_legendre(2 * count + 4)
-    legendre, number = np.polynomial.legendre.legvander, count + len(given)
-    weight = w / 2 * ((1 + x) / 2) ** power
-    P, signed = legendre(x, count - 1), weight * np.prod([(1 + x) / 2 - at for at in given], axis=0)
-    signed = np.sign(signed.sum()) * signed[:, None] * P
-    free = scipy.linalg.eigh(P.T @ (x[:, None] * signed), P.T @ signed, eigvals_only=True)
-    points = np.sort([*((1 + free) / 2), *given])
-    return points, np.linalg.solve(legendre(2 * points - 1, number - 1).T, legendre(x, number - 1).T @ weight)
-
-
-def covers(X: Array) -> float:
-    """How far the farthest place of an equilateral triangle is from the nearest of some points, over its side."""
-    lattice = np.array([(i, j) for i in range(FINE + 1) for j in range(FINE + 1 - i)]) / FINE
-    equal = np.array([[1.0, 0.0], [0.5, np.sqrt(3) / 2]])
-    return float(np.linalg.norm((lattice[:, None] - X) @ equal, axis=2).min(axis=1).max()) + 1 / FINE
-
-
 def centroid(corners: Array) -> Array:
     """(n, 2) of polygons that have an area."""
     at = corners - corners[:, :1]
@@ -275,6 +228,8 @@ class Segments:
         Of the rule on whole cells and on large parts, and on small parts.
     h
         Thickness over R.
+    planes
+        Of symmetry: an edge goes on in its image, and does not turn there.
 
     Attributes
     ----------
@@ -284,10 +239,20 @@ class Segments:
         (cells,): no place of a cell is farther from all points of the rule.
     """
 
-    def __init__(self, cells: Cells, own: Longs, r0: Array, degrees: tuple[int, int], h: float) -> None:
-        self._cells, self._r0 = cells, r0
-        self._degrees, self._turns, self._before = degrees, cells.turns(r0, TURN), CORNER * h
+    def __init__(
+        self,
+        cells: Cells,
+        own: Longs,
+        r0: Array,
+        degrees: tuple[int, int],
+        h: float,
+        planes: Sequence[Mirror] = (),
+    ) -> None:
+        self._cells, self._r0, self._degrees, self._before = cells, r0, degrees, CORNER * h
         corners = self._corners(r0, np.arange(len(cells.nodes)))
+        self._turns = cells.turns(r0, TURN)
+        for plane in planes:
+            self._turns &= np.abs(plane.beyond(corners)) > CLOSE
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         inside, at_edge = covers(inner_rule(degrees[0])[0]), covers(ending_rule(degrees[0])[0])
         self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(inside, at_edge), inside)

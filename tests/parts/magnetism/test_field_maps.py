@@ -1,6 +1,6 @@
 """Maps of the field: the sensors' values and magpylib's at their places, files, picture and what is refused."""
 
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import yaml
 from command import magshell
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
@@ -16,7 +19,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.grids import grid_content, read_map
 from magshell_fenicsx.output.fields.vtu import FieldSeries
-from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, outlines, plane_of, section
+from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, outlines, plane_of, section, with_holes
 from magshell_fenicsx.output.pictures.plot import Drawn, plot
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Grid
@@ -167,3 +170,19 @@ def test_what_is_refused(changed: dict[str, Any], sections: dict[str, Any], said
     data = {k: v for k, v in (case(field_maps={"box": BOX | changed}) | sections).items() if v is not None}
     with pytest.raises(CaseError, match=said):
         Case.from_source(data).problem()
+
+
+def test_a_hole_in_a_cut_is_not_filled() -> None:
+    """Of two circles, one in the other, drawn either way round, and of none."""
+    angles = np.linspace(0, 2 * np.pi, 41)[:-1]
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for outer, inner in product((circle, circle[::-1]), repeat=2):
+        image = Figure(figsize=(1, 1), dpi=50)
+        canvas = FigureCanvasAgg(image)
+        axes = image.add_axes((0, 0, 1, 1), xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
+        axes.set_axis_off()
+        axes.add_patch(PathPatch(with_holes([outer, 0.5 * inner]), color="0"))
+        canvas.draw()
+        grey = np.asarray(canvas.buffer_rgba())[..., 0]
+        assert [grey[25, x] for x in (1, 10, 25, 40)] == [255, 0, 255, 0]
+    assert not len(with_holes([]).vertices)
