@@ -24,8 +24,8 @@ from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
 from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, ROUNDS
-from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.rules import BEFORE
+from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
 
 Array = NDArray[np.float64]
