@@ -216,12 +216,14 @@ def crossings(D: Map, back: Map, first: Vector, comm: MPI.Comm) -> Crossings | N
         krylov, size = Krylov(lambda v: apart(back(D(v))), apart(first), comm, MOST), 0
         while True:
             size = krylov.grow()
+            if not np.isfinite(krylov.H[:size, :size]).all():
+                return None
             values, vectors = np.linalg.eig(krylov.H[:size, :size])
             errors = abs(krylov.H[size, size - 1] * vectors[-1])
             far = np.flatnonzero(np.abs(values) > SMALL)
             if size >= LEAST and np.all(errors[far] < SURE * np.minimum(abs(1 + values[far]), abs(values[far]))):
                 break
-            if size == MOST or not np.isfinite(values).all():
+            if size == MOST:
                 return None
         doubt = max(doubt, float((np.abs(values) / np.abs(1 + values)).max()))
         if not len(far):

@@ -72,8 +72,8 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        The part of the straight way from a point to a first guess just behind which forces set in: a step ends there.
-        Zero if the guess loses forces of the point: then its tangent alone foresees the next one.
+        The part of the straight way from a point to a first guess at which forces set in: a step ends there. Whether that
+        is just behind, or just before. Zero if the guess loses forces of the point: then its tangent alone foresees.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Path:
         scale: float = 1.0,
         journal: Journal | None = None,
         progress: Progress | None = None,
-        setting_in: Callable[[State, State], float] = lambda here, guess: 1.0,
+        setting_in: Callable[[State, State], tuple[float, bool]] = lambda here, guess: (1.0, False),
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
@@ -248,14 +248,17 @@ class Path:
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 seen = passed[-3:] if smooth else passed[-2:]
-                part = self._setting_in(here.state, self._extended(s, seen)) if here is not vain else 1.0
+                part, sets_in = (
+                    self._setting_in(here.state, self._extended(s, seen)) if here is not vain else (1.0, False)
+                )
                 if not part:
                     seen, part = passed[-1:], 1.0
                 s = here.s + part * (s - here.s) if part < 1 else s
                 tried = self._try(s, seen)
+                tried = self._reached(here, tried) if part < 1 and not sets_in else tried
                 if isinstance(tried, _Far):
                     far, tried = tried, tried.reason
-                if isinstance(tried, str) and part < 1:
+                if isinstance(tried, str) and part < 1 and sets_in:
                     vain, far = here, None
                     continue
                 if isinstance(tried, str):
@@ -369,6 +372,13 @@ class Path:
         unexplained = chord - (there.s - here.s) / 2 * (here.du + there.du)
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
         return self._cosine(here, there) >= self.options.turn and gap <= max(self.options.gap * whole, SEEN)
+
+    def _reached(self, here: Point, there: Point | _Far | str) -> Point | _Far | str:
+        """A point before forces set in, unless they did, or there is a corner."""
+        if not isinstance(there, Point):
+            return there
+        clear = self._setting_in(here.state, there.state)[0] == 1.0
+        return there if clear and self._smooth(here, self.seen_from(here, there)) else TURNS
 
     def _corner(self, here: Point, there: Point) -> bool:
         """Whether the path has a corner between two points, from before which nothing behind it is foreseen."""

@@ -37,8 +37,8 @@ def targets_between(
     around = [path.seen_from(low, path.measured_from(low, point)) for point in smooth]
     inside = [target for target in targets if (target - a) * (target - b) < 0 or b == target]
     for target in sorted(inside, key=lambda target: abs(target - a)):
-        point = _solved(path, quantity, target, around)
-        around.insert(-1, path.seen_from(low, path.measured_from(low, point)))
+        point = path.measured_from(low, _solved(path, quantity, target, around))
+        around.insert(-1, path.seen_from(low, point))
         yield target, point
 
 

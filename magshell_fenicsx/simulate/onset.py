@@ -1,4 +1,4 @@
-"""Where on the way to a first guess shells begin to touch: a step ends just behind, with the force in its tangent.
+"""Where on the way to a first guess shells begin to touch: a step ends just before, and the next one just behind.
 
 A guess from before a contact knows nothing of it: shells would lie deep in each other, and Newton's method circle.
 """
@@ -13,25 +13,27 @@ from magshell_fenicsx.parts.touching.touching import NEARER, Touching
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
-DEEP = 2e-3  # of the thickness: how far past the first contact the guess of a step leads; as for bodies
+DEEP = 2e-3  # of the thickness: how far before and past the first contact the guesses of two steps lead
+CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
 
 
-def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> float:
-    """The part of the straight way between two states of a step behind which shells touch that do not yet; collective.
+def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> tuple[float, bool]:
+    """The part of the straight way between two states of a step where shells meet that do not touch yet; collective.
 
-    1 if none do; 0 if those that touch at the first one let go.
+    Just before, and `False`; or just behind, and `True`, where the first state is near enough. 1 if none meet; 0 if
+    those that touch at the first state let go.
     """
     touchings = [each for each in scene.model.touchings if isinstance(each, Touching)]  # not those on meridians
     if not touchings:
-        return 1.0
+        return 1.0, False
     ends = leave(here), leave(guess)
     here_at, guess_at = map(scene.model.system.at, ends)
     u, v = (of_all_nodes(scene, state) for state in ends)
-    parts = list[float]()
+    parts = list[tuple[float, bool]]()
     for each in touchings:
         if here_at.of(each.penetration):
-            parts.append(float(guess_at.of(each.penetration) > 0))
+            parts.append((float(guess_at.of(each.penetration) > 0), False))
         else:
             parts.append(_onset(each, each.pair.thickness * scene.problem.material.h, u, v))
     return min(parts)
@@ -44,22 +46,23 @@ def of_all_nodes(scene: Scene, state: State) -> Array:
     return np.asarray(np.concatenate(parts).reshape(-1, 3))
 
 
-def _onset(touching: Touching, h: float, u: Array, v: Array) -> float:
+def _onset(touching: Touching, h: float, u: Array, v: Array) -> tuple[float, bool]:
     """The same for a pair that does not touch, between two displacements."""
     most, deep = 2 * float(np.linalg.norm(v - u, axis=1).max()), DEEP * h
     if not most or not touching.meet(u, v) or (at_low := touching.gap(u)) <= 0:
-        return 1.0
-    low = high = at_high = 0.0
+        return 1.0, False
+    sets_in = at_low < CLOSE * deep
+    low, high, at_high, aim = 0.0, 0.0, 0.0, -deep if sets_in else deep
     for _ in range(MOST):
         if high:
-            part = low + (high - low) * (at_low + deep) / (at_low - at_high)
+            part = low + (high - low) * (at_low - aim) / (at_low - at_high)
         else:  # so far no face can pass through another one
             part = min(1.0, low + (at_low + NEARER * h) / most)
         gap = touching.gap(u + part * (v - u))
-        if gap < -2 * deep:
+        if gap < aim - deep:
             high, at_high = part, gap
-        elif gap <= 0 or part == 1.0:
-            return part
+        elif gap <= aim + deep or part == 1.0:
+            return part, sets_in
         else:
             low, at_low = part, gap
-    return high or low
+    return (high if sets_in else low) or low, sets_in
