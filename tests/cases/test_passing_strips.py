@@ -17,7 +17,7 @@ CASE: dict[str, Any] = {
         "lower": {"shell": STRIP, "boundary": {"right": "clamped"}},
         "upper": {
             "shell": STRIP | {"length": 0.6, "youngs_modulus": 100}, "boundary": HELD,
-            "place": {"position": [0.2, 0, 1.5 * h], "axis": {"polar": -1, "azimuth": 0}},
+            "place": {"position": [0.2, 0, 1.6 * h], "axis": {"polar": -1, "azimuth": 0}},
         },
     },
     "contact": [["upper", "lower"]],
