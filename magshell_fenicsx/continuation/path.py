@@ -72,8 +72,8 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        The part of the straight way from a point to a first guess at which forces set in, where a step ends. And whether
-        that is just behind. Zero if the guess loses forces of the point: then its tangent alone foresees the next one.
+        The part of the straight way from a point to a first guess at which forces set in: a step ends there. Whether it
+        is just behind. Zero if the guess loses forces of the point: then its tangent alone foresees the next one.
     """
 
     def __init__(
