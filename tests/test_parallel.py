@@ -146,7 +146,8 @@ PARTS = [[QUICKEST], *([pytest.param(REST[i::4], marks=pytest.mark.slow, id=f"pa
 def test_same_path(tmp_path: Path, scenes: list[str]) -> None:
     """Every column to 1e-8 of its largest value, second derivatives to 1e-5; the same steps, pivots and iterations.
 
-    Between targets to 1e-5: where a step ends follows from small differences between the points before it.
+    Between targets to 1e-7; of a natural shape, which moves far within a step, to 1e-5: where a step ends follows from
+    small differences between the points before it.
     """
     for ranks in (1, 2, 3):
         chosen = [scene for scene in scenes if ranks != 2 or scene == ON_TWO]
@@ -157,7 +158,7 @@ def test_same_path(tmp_path: Path, scenes: list[str]) -> None:
             done = all_started(commands, ranks)
             assert done.returncode == 0, done.stderr
     for scene in scenes:
-        _compare(sorted((tmp_path / scene).iterdir()))
+        _compare(sorted((tmp_path / scene).iterdir()), 1e-5 if scene == "a natural shape" else 1e-7)
 
 
 def _command(scene: str, out: Path) -> list[str]:
@@ -167,7 +168,7 @@ def _command(scene: str, out: Path) -> list[str]:
     return ["run", str(CASES / file), *mesh, *settings, *pictures, "--out", str(out)]
 
 
-def _compare(folders: list[Path]) -> None:
+def _compare(folders: list[Path], of_steps: float) -> None:
     paths = [read_path(out) for out in folders]
     fields = [read_vtu(max((out / "fields").glob("point_*.vtu")))[0] for out in folders]
     for other in paths[1:]:
@@ -179,7 +180,7 @@ def _compare(folders: list[Path]) -> None:
             scale = max((abs(float(row[key])) for row in paths[0] for key in group), default=0.0)
             for key in group:
                 for row, there in zip(paths[0], other, strict=True):
-                    near = 1e-5 if row["label"] == "step" else 1e-8
+                    near = of_steps if row["label"] == "step" else 1e-8
                     wanted = pytest.approx(float(row[key]), rel=0, abs=max(near * scale, 1e-18))
                     assert float(there[key]) == wanted, (key, row["point"])
     one = fields[0]

@@ -1,11 +1,4 @@
 /* Products of (3, 3) blocks, stored row by row, with a vector: memory bounds them, so each entry is read once. */
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define FAST
-#endif
-
-#define INLINE static inline __attribute__((always_inline))
 
 typedef double eight __attribute__((vector_size(64), aligned(8)));
 typedef float eight_floats __attribute__((vector_size(32), aligned(4)));

@@ -17,12 +17,12 @@ from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import Touching
-from magshell_fenicsx.simulate.onset import of_all_nodes
+from magshell_fenicsx.simulate.onset import DEEP, of_all_nodes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
 
-DEEP = tuple(2e-3 / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
+TRIED = tuple(DEEP / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
 NEAR = 1e-7  # of h: a smaller gap is none
 FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
 MOST = 1000  # approaches by the least gap
@@ -50,12 +50,12 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
         if gap <= NEAR:
             break
         state = state.with_(state.u, name, state.mu[name] + gap)
-        if state.mu[name] + DEEP[0] >= end:
+        if state.mu[name] + DEEP >= end:
             return state.with_(state.u, name, end)
     else:
         raise Stopped("the body does not meet the shell")
     reason = ""
-    for deep in DEEP:
+    for deep in TRIED:
         a = state.mu[name] + deep
         outcome = scene.newton.solve(state.with_(state.u, name, a), name, GivenLoad(name, a))
         if outcome.converged:

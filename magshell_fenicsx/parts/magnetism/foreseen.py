@@ -39,9 +39,9 @@ class Known:
 class Foreseen:
     """Forces near states at which they were computed, by an earlier second derivative D and by what D lacks.
 
-    Without D u they are, along the path, a polynomial through its last points, with slopes where two states near each
-    other tell them. Beside it the latest changes of u, of which the newest is the first, say what D and this polynomial
-    lack (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+    Along the path, the forces without D u are a polynomial through its last points. It has slopes at points where two
+    states near each other are known. Changes of u beside the path correct D and the polynomial by secants, the newest
+    change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
     """
 
     def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array]) -> None:
@@ -139,7 +139,7 @@ class Along:
 
     @classmethod
     def through(cls, points: list[list[Known]]) -> "Along":
-        """Through the last states of points, of which the last is the newest."""
+        """The polynomial through the last state of each point; the newest point is the last."""
         base, before = points[-1][-1], points[-2][-1] if len(points) > 1 else None
         if before is None or np.array_equal(before.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))

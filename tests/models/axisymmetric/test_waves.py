@@ -17,6 +17,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.waves import Banded
 
 Array = np.ndarray
 FIELD = Magnetisation(radial, E3, gradient=np.diag([0.5, 0.5, -1.0]))
@@ -167,3 +168,26 @@ def test_counts_of_all_waves_are_those_of_each(R_over_h: float, lambda_m: float)
     counts = waves.counts(state)
     assert {m: count for m, count in enumerate(counts, 1) if count} == waves.unstable(state)
     assert sum(counts) == (13 if R_over_h == 300 else 0)
+
+
+@pytest.mark.telling
+@pytest.mark.parametrize("triangle", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_definite_or_not(seed: int, triangle: bool) -> None:
+    """Two matrices of one sparsity, or their triangles, interpolated so that the least eigenvalue crosses zero."""
+    random, n = np.random.default_rng(seed), 30
+    order = random.permutation(n)  # of a band that the numbering hides
+    near = np.abs(order[:, None] - order) <= 3
+    A, B = (np.where(near, x + x.T, 0.0) for x in random.standard_normal((2, n, n)))
+    A += 100 * np.eye(n)  # definite, and so is A + t (B - A) for small t alone
+    rows, columns = np.nonzero(np.triu(near) if triangle else near)
+    held = np.array([0, 7], dtype=np.int32)
+    banded = Banded(rows, columns, held)
+    bands = banded.bands([A[rows, columns], B[rows, columns]])
+    free = np.setdiff1d(np.arange(n), held)
+
+    def least(t: float) -> float:
+        return float(np.linalg.eigvalsh((A + t * (B - A))[np.ix_(free, free)])[0])
+
+    seen = {banded.positive(bands, np.array([1.0 - t, t])): least(t) > 0 for t in np.linspace(0, 0.99, 40)}
+    assert seen == {True: True, False: False}

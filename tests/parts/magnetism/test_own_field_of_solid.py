@@ -29,7 +29,7 @@ UPRIGHT = np.array([[1.2, 0.0, 0.1], [0.0, 0.9, 0.0], [0.1, 0.0, 0.7]])
 
 
 def made(magnetic: dict[str, Any], places: np.ndarray = PLACES, **sections: Any) -> Scene:
-    """A block at the places of which the field is read."""
+    """A magnetised block, and places where its field is read."""
     sensors = {f"s{i}": {"position": [0, 0, "40 mm"]} for i in range(len(places))}
     given = {"shell": BLOCK, "boundary": {"root": "clamped"}, "model": "solid", "symmetry": "none",
              "magnetic": {"applied": {"flux_density": "1 mT"}, **magnetic}, "sensors": sensors,
