@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism.by_charges import Weights, add
 from magshell_fenicsx.parts.magnetism.charged import STEP, Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.close import Close
 from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
@@ -58,6 +59,7 @@ class Kind:
         self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None, *, may: bool = False
     ) -> None:
         self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
+        self.faces = edge is None
         self.family = Faces(shape, cells, may=may) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
         count = len(copies.images)
         self.cells = np.concatenate([cells + copy * len(shape.r0) for copy in range(count)])
@@ -164,14 +166,18 @@ class Charged:
             self._apart[cell] = 1
             self._apart[cell, others] = 0
         self._parts = parts
+        assert isinstance(kinds[0].family, Faces)
+        self._close = Close(shape, kinds[0].family, copies, comm, rate(DEGREES[-1]))
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))
         self._grid: Grid | None = None
         self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
 
-    def rules(self, nodes: Array, own: range) -> NDArray[np.int8]:
+    def rules(self, nodes: Array, own: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
         """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that has none here.
+
+        And the pairs whose faces are close: they have a rule of their own.
 
         Raises
         ------
@@ -180,10 +186,13 @@ class Charged:
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
         apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
+        close = self._close.of(nodes, own, apart)
+        apart &= ~close
         rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
         if rules is None:
             raise Touching
-        return rules
+        rules[close] = len(DEGREES) - 1
+        return rules, close
 
     def boxes(self, nodes: Array, own: range) -> tuple[Far, NDArray[np.bool_]]:
         """Cells far from each other by boxes, and the pairs (own, copies * cells) that are too near for that.
@@ -215,7 +224,7 @@ class Charged:
         Touching
             See `rules`.
         """
-        rules, gradient = self.rules(nodes, own), np.zeros_like(nodes)
+        (rules, close), gradient = self.rules(nodes, own), np.zeros_like(nodes)
         far = self.boxes(nodes, own)[0]
         energy = far.add(far.placed(nodes), bent=stiffness is not None)
         first, second = np.nonzero(rules >= 0)
@@ -228,6 +237,8 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
                 charged = (one_row >= 0) & (other_row >= 0)
+                if one.faces and other.faces:
+                    charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
                 left, right = (one.rule(int(number)), one_row[charged]), (other.rule(int(number)), other_row[charged])
                 count = int(charged.sum())
                 energy += share * self._pairs.add(nodes, cells[charged], count, left, right, gradient, stiffness)
@@ -235,6 +246,11 @@ class Charged:
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:
             energy += self._near.add(nodes, gradient, stiffness)
+        if close.any() and self._kinds[0].faces:
+            of_close = self._close.add(nodes, own, close, gradient, stiffness)
+            if of_close is None:
+                raise Touching
+            energy += of_close
         if stiffness:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
@@ -250,7 +266,7 @@ class Charged:
         Touching
             See `rules`.
         """
-        rules, moved = self.rules(nodes, own), nodes + STEP * 1j * rates
+        (rules, close), moved = self.rules(nodes, own), nodes + STEP * 1j * rates
         into = self._shape.nothing(of_shape=of_shape)
         far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
         on_far = far.by_charges(nodes, moved, cells_far, weights, heights=of_shape)
@@ -265,12 +281,16 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
                 charged = (one_row >= 0) & (other_row >= 0)
+                if one.faces and other.faces:
+                    charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
                 left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
                 one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
                 if of_shape:
                     one.back_of_heights(number, add(moved, cells[charged], left, right, weights, heights=True)[0], into)
         if self._near:
             self._near.by_fields(moved, weights, into)
+        if close.any() and self._kinds[0].faces:
+            self._close.by_fields(nodes, own, close, moved, weights, into)
         return into
 
 
