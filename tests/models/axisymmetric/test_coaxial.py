@@ -246,7 +246,7 @@ def test_two_caps_are_one_on_a_plane() -> None:
 
 @pytest.mark.slow
 def test_a_wave_that_comes_and_goes_in_contact() -> None:
-    """Both domes tilt (m = 1) in a window between two points, pressed together: where 100 loads find it on this mesh."""
+    """Pressed domes tilt (m = 1) in a window with a point of the path, where 100 loads find it on this mesh."""
     dome = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.015, "poisson_ratio": 0.3}
     lower, upper = ({"shell": dome | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (3, 1))
     upper["place"] = {"position": [0, 0, 1.5 * 0.015]}
