@@ -235,8 +235,8 @@ def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     places = patch.embedding(patch.nodes)
     beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
     kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
-    corners = beyond[patch.cells[kept, :3]]
-    if not kept.any() or (~kept).sum() == 0 or corners.min() < -ROUNDING * extent:
+    corners = np.where(kept[:, None], beyond[patch.cells[:, :3]], -beyond[patch.cells[:, :3]])
+    if kept.all() or not kept.any() or corners.min() < -ROUNDING * extent:
         raise MeshError(
             f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"
         )
