@@ -1,12 +1,15 @@
-"""The energy of the faces of cells of different parts that lie above each other, nearer than rules on cells resolve.
+"""The energy of the faces of cells that lie above each other, nearer than rules on both cells resolve.
 
-Each of Gauss's points of the first cell sees the second in polar coordinates about its foot on it, with r = s sinh v
-and the gap s between the faces there: a rule that is exact at any gap, as in `touching`, but with the state it moves.
-What it misses of a derivative is of the order of its error. Faces that press on each other count as just apart: so the
-pull between them is that of a gap of `LEAST`, whatever the penetration of their contact is.
+Each of Gauss's points of the first cell sees the second in polar coordinates about its foot on it, with r = s sinh v,
+the gap s between the faces there, and t = sqrt(p² + s²) sinh w along each side at a distance p: what is integrated has
+no pole nearer than pi/2 at any gap, so Gauss's rules converge as fast at all (Trefethen, Approximation Theory, theorem
+19.3). The places follow the state; what that misses of a derivative is of the order of the error.
+
+What all cells of a part make together is smooth above it, what one of them makes is not. So of two parts it is always
+the smaller one whose points see the other. Faces that press on each other count as just apart: the pull between them is
+that of a gap of `LEAST`, whatever the penetration of their contact is.
 """
 
-from collections.abc import Iterator
 from functools import cached_property
 
 import basix
@@ -23,54 +26,42 @@ from magshell_fenicsx.parts.magnetism.touching import CORNERS, ENDS
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 DEGREE = 14  # of the rule on the first cell
-RAYS, RADIAL = 7, 12  # points over a sector of rays, and along a ray
+PRECISION = 1e-6  # of what one of its points sees of the second
+GAUSS, MOST = 24, 3 * 24**2  # points of the longest rule, and points that are seen at most, as in close.c
+OF_CHARGES = 5  # degree of charges on a cell
+REACH = 0.25  # of the size of cells: nearer faces are close
 LEAST = 1e-3  # of the thickness: nearer faces count as so far apart
-ABOVE = 0.6  # part of a distance that is along the normal: else cells are beside each other
 INSIDE = 0.5  # of the thickness: mid-surfaces that are nearer are in each other
-TINY = 1e-12
+ALONG = 0.7  # cosine of the angle of cells that lie above each other, at least
 CHARGES = basix.create_element(
-    basix.ElementFamily.P, basix.CellType.triangle, 4, basix.LagrangeVariant.gl_isaac, discontinuous=True
+    basix.ElementFamily.P, basix.CellType.triangle, OF_CHARGES, basix.LagrangeVariant.gl_isaac, discontinuous=True
 )
+BORDER = np.concatenate([CORNERS[i] + np.arange(4)[:, None] / 4 * (CORNERS[j] - CORNERS[i]) for i, j in ENDS])
 
 
-def fans(apex: Array, s: Array) -> tuple[Array, Array]:
-    """Points (m, M, 2) and weights (m, M) of the reference triangle as seen from places (m, 2) with scales (m,).
-
-    It is the sum of the three triangles between a place and a side; with a negative weight where that is behind it.
-    """
-    V, (v, wv), (x, wx) = CORNERS - apex[:, None], gauss(RADIAL), gauss(RAYS)
-    points, weights = list[Array](), list[Array]()
-    for i, j in ENDS:
-        along = (CORNERS[j] - CORNERS[i]) / np.linalg.norm(CORNERS[j] - CORNERS[i])
-        outward = np.array([along[1], -along[0]])
-        p = V[:, i] @ outward
-        side, p = np.where(p < 0, -1.0, 1.0), np.maximum(np.abs(p), TINY)
-        first, last = (np.arcsinh(V[:, k] @ along / p) for k in (i, j))
-        mu = first[:, None] + (last - first)[:, None] * x
-        rays = (side[:, None, None] * outward + np.sinh(mu)[..., None] * along) / np.cosh(mu)[..., None]
-        top = np.arcsinh(p[:, None] * np.cosh(mu) / s[:, None])
-        r = s[:, None, None] * np.sinh(top[..., None] * v)
-        dr = s[:, None, None] * np.cosh(top[..., None] * v) * top[..., None] * wv
-        angle = (side * (last - first))[:, None] * wx / np.cosh(mu)
-        points.append((apex[:, None, None] + r[..., None] * rays[:, :, None]).reshape(len(apex), -1, 2))
-        weights.append((angle[..., None] * r * dr).reshape(len(apex), -1))
-    return np.concatenate(points, axis=1), np.concatenate(weights, axis=1)
+def monomials(X: Array, degree: int) -> Array:
+    """(n, ..) at places (n, 2), in the order of close.c."""
+    return np.stack([X[:, 0] ** (n - j) * X[:, 1] ** j for n in range(degree + 1) for j in range(n + 1)], axis=1)
 
 
-def to_triangle(x: Array, corners: Array) -> Array:
-    """Vectors (n, m, 3) to places (n, m, 3) from the nearest ones of flat triangles (n, 3, 3)."""
+def of_nodes(element: basix.finite_element.FiniteElement) -> Array:
+    """(monomials, nodes) what the values at nodes of a Lagrange element multiply."""
+    return np.ascontiguousarray(np.linalg.inv(monomials(np.asarray(element.points), element.degree)))
+
+
+def distances(x: Array, corners: Array) -> tuple[Array, Array]:
+    """The least distance (n,) of places (n, m, 3) from flat triangles (n, 3, 3), and how much of it is across them."""
     sides = corners[:, [1, 2, 0]] - corners
     normal = unit(np.asarray(np.cross(sides[:, 0], sides[:, 1]), dtype=np.float64))
-    best, within = np.full(x.shape, np.inf), np.ones(x.shape[:2], dtype=bool)
-    for k in range(3):
-        off, side = x - corners[:, None, k], sides[:, None, k]
-        t = np.clip(np.sum(off * side, axis=-1) / np.sum(side * side, axis=-1), 0.0, 1.0)
-        rest = off - t[..., None] * side
-        nearer = np.sum(rest * rest, axis=-1) < np.sum(best * best, axis=-1)
-        best[nearer] = rest[nearer]
-        within &= np.einsum("nmi,ni->nm", off, np.cross(normal, sides[:, k])) >= 0
-    across = np.einsum("nmi,ni->nm", x - corners[:, None, 0], normal)
-    return np.where(within[..., None], across[..., None] * normal[:, None], best)
+    off = x[:, :, None] - corners[:, None]
+    across = np.einsum("nmi,ni->nm", off[:, :, 0], normal)
+    behind = np.einsum("nmki,nki->nmk", off, np.cross(normal[:, None], sides))
+    square = np.sum(sides * sides, axis=-1)
+    t = np.clip(np.einsum("nmki,nki->nmk", off, sides) / square[:, None], 0.0, 1.0)
+    to_sides = np.linalg.norm(off - t[..., None] * sides[:, None], axis=-1).min(axis=-1)
+    distance = np.where((behind >= 0).all(axis=-1), np.abs(across), to_sides)
+    rows, at = np.arange(len(x)), distance.argmin(axis=1)
+    return distance[rows, at], np.abs(across[rows, at])
 
 
 class Close:
@@ -80,153 +71,139 @@ class Close:
     ----------
     shape
         All cells that are modelled.
-    reach
-        The distance of faces, over the size of cells, up to which they are.
+    order
+        (copies * cells,) of two cells the first is that with the lower number.
     """
 
-    def __init__(self, shape: Shape, faces: Faces, copies: Copies, comm: MPI.Comm, reach: float) -> None:
-        self._shape, self._faces, self._copies, self._reach = shape, faces, copies, reach
+    def __init__(self, shape: Shape, faces: Faces, copies: Copies, order: Ints, comm: MPI.Comm) -> None:
+        self._shape, self._faces, self._copies, self._order = shape, faces, copies, order
         self._pairs = Pairs(comm)
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREE)
-        self._X, self._w = np.asarray(X), np.asarray(w)
-        self._tables = np.ascontiguousarray(self._tabulated(self._X))
+        self._X, self._w = np.array(X), np.array(w)
+        self._border = shape.element.tabulate(0, BORDER)[0, :, :, 0]
 
     def of(self, nodes: Array, own: range, apart: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """(own, cells) which of the pairs that are `apart` lie above each other, close."""
+        close, h = np.zeros(apart.shape, dtype=bool), self._shape.h
         middle = nodes.mean(axis=1)
         radius = np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)
-        part = slice(own.start, own.stop)
-        size = 2 * np.maximum(radius[part, None], radius)
-        ball = np.linalg.norm(middle[part, None] - middle, axis=-1) - radius[part, None] - radius
-        near = (apart != 0) & (ball < self._shape.h + self._reach * size)
-        first, second = np.nonzero(near)
-        if not len(first):
-            return np.asarray(near)
-        c, d = first + own.start, second
-        least: Array = np.full(len(c), np.inf)
-        along: Array = np.zeros(len(c))
-        for one, other in ((c, d), (d, c)):
-            corners = np.asarray(nodes[one, :3], dtype=np.float64)
-            normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-            away = to_triangle(nodes[other], corners)
-            distance = np.linalg.norm(away, axis=-1)
-            at = distance.argmin(axis=1)
-            rows, nearest = np.arange(len(one)), distance.min(axis=1)
-            up = np.abs(np.sum(away[rows, at] * normal, axis=-1))
-            along = np.where(nearest < least, up, along)
-            least = np.minimum(least, nearest)
-        near[first, second] = (least - self._shape.h < self._reach * size[first, second]) & (along > ABOVE * least)
-        return np.asarray(near)
+        normal = unit(np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0]))
+        first, second = np.nonzero(apart)
+        c = first + own.start
+        size = 2 * np.maximum(radius[c], radius[second])
+        ball = np.linalg.norm(middle[c] - middle[second], axis=-1) - radius[c] - radius[second]
+        may = (ball < h + REACH * size) & (np.abs(np.sum(normal[c] * normal[second], axis=-1)) > ALONG)
+        if not may.any():
+            return close
+        first, second, c, size = (each[may] for each in (first, second, c, size))
+        border = np.einsum("mk,nki->nmi", self._border, nodes)
+        one, other = (distances(border[a], nodes[b, :3]) for a, b in ((c, second), (second, c)))
+        least, up = np.where(one[0] < other[0], one, other)
+        close[first, second] = (least - h < REACH * size) & (up > INSIDE * h)
+        return close
 
     def add(
-        self, nodes: Array, own: range, near: NDArray[np.bool_], gradient: Array, stiffness: Stiffness | None = None
-    ) -> float | None:
+        self, nodes: Array, own: range, close: NDArray[np.bool_], gradient: Array, stiffness: Stiffness | None = None
+    ) -> float:
         """The energy of pairs that own cells are in, each half; their gradient (cells, k, 3) is added.
 
-        None if two cells are in each other.
+        It is no number if two cells are in each other.
         """
-        energy, row = 0.0, np.zeros(1, dtype=np.int64)
-        for one, other, both in self._ordered(own, near):
-            found = self._points(nodes, one, other)
-            if found is None:
-                return None
-            left, right, _ = found
-            cells = np.array([[one, other]])
-            share = 1.0 if both else 0.5
-            energy += share * self._pairs.add(nodes, cells, 1, (left, row), (right, row), gradient, stiffness)
-            self._pairs.finish(nodes, cells[:, 0], left, gradient, stiffness)
-        return energy
+        pairs, both = self._ordered(own, close)
+        energies = [self._pairs.add_close(self._cells, nodes, pairs[of], gradient, stiffness) for of in (both, ~both)]
+        return energies[0] + 0.5 * energies[1]
 
     def by_fields(
-        self, nodes: Array, own: range, near: NDArray[np.bool_], moved: Complex, weights: Weights, into: Nodal
+        self, nodes: Array, own: range, close: NDArray[np.bool_], moved: Complex, weights: Weights, into: Nodal
     ) -> None:
         """Add the derivatives that `into` has, of own cells: see `Charged.by_fields`."""
         on_charges, row = np.zeros_like(self._charges), np.zeros(1, dtype=np.int64)
-        for one, other, _ in self._ordered(own, near):
-            found = self._points(nodes, one, other)
-            if found is None:
+        for one, other in self._ordered(own, close)[0]:
+            seen = self._pairs.seen(self._cells, nodes, one, other, MOST)
+            if seen is None:
                 continue
-            left, right, X = found
+            X, w, shift = seen
+            places, flat = (self._X, X.reshape(-1, 2)), (len(self._X), w.shape[1])
+            (t, q), (t_of, q_of) = (self._of(cell, at) for cell, at in zip((one, other), places, strict=True))
+            layers = self._heights + (shift / t)[:, None]
+            left = Points(self._tabulated(self._X), layers, t[None], self._w[None, :, None] * q)
+            q_of = w.reshape(1, *flat, 1) * q_of.reshape(1, *flat, -1)
+            tables = self._tabulated(places[1]).reshape(*flat, 3, -1)
+            right = Points(tables, np.broadcast_to(self._heights, q_of.shape[1:]), t_of.reshape(1, *flat), q_of)
             pair, sides = np.array([[one, other]]), ((left, row), (right, row))
             on_q = add(moved, pair, *sides, weights)
             on_heights = None if into.by_thickness is None else add(moved, pair, *sides, weights, heights=True)
-            for i, (cell, places, weight) in enumerate(((one, self._X, self._w), (other, X[0], X[1]))):
+            for i, (cell, at, weight) in enumerate(zip((one, other), places, (self._w, w.ravel()), strict=True)):
                 if cell not in own:
                     continue
-                copy, at = divmod(cell, len(self._shape.r0))
-                basis, layers = CHARGES.tabulate(0, places)[0, :, :, 0], self._charges.shape[-1]
-                on = self._copies.charges[copy] * weight[:, None] * on_q[i].reshape(-1, layers)
-                on_charges[at] += basis.T @ on
+                copy, number = divmod(cell, len(self._shape.r0))
+                on = self._copies.charges[copy] * weight[:, None] * on_q[i].reshape(len(at), -1)
+                on_charges[number] += (monomials(at, OF_CHARGES) @ of_nodes(CHARGES)).T @ on
                 if on_heights:
-                    on_t = self._copies.up[copy] * (on_heights[i].reshape(-1, layers) @ self._heights)
-                    self._shape.back_of_thickness(np.array([at]), places, on_t[None], into)
+                    on_t = self._copies.up[copy] * (on_heights[i].reshape(len(at), -1) @ self._heights)
+                    self._shape.back_of_thickness(np.array([number]), at, on_t[None], into)
         made = self._faces.at(*self._nodes_of_charges, into)
         assert made.back
         made.back(np.zeros_like(made.x), on_charges)
 
-    def _ordered(self, own: range, near: NDArray[np.bool_]) -> Iterator[tuple[int, int, bool]]:
-        """The pairs, the same cell first in both orders and of images, each once; and whether both are own cells."""
-        count = len(self._shape.r0)
-        for c, d in zip(*np.nonzero(near), strict=True):
-            one, other = int(c) + own.start, int(d)
-            both = other in own
-            if not (both and one > other):
-                yield *((one, other) if one % count <= other % count else (other, one)), both
-
-    def _points(self, nodes: Array, one: int, other: int) -> tuple[Points, Points, tuple[Array, Array]] | None:
-        """Those of two cells, with places and weights on the second; None if these are in each other."""
-        h, T = self._shape.h, self._tables
-        r, a1, a2 = (T[:, i] @ nodes[one] for i in range(3))
-        n, corners = unit(np.cross(a1, a2)), nodes[other, :3]
-        J = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=-1)
-        back, element = np.linalg.pinv(J), self._shape.element
-        apex = (r - corners[0]) @ back.T
-        for _ in range(2):
-            apex = apex + (r - element.tabulate(0, apex)[0, :, :, 0] @ nodes[other]) @ back.T
-        off = r - element.tabulate(0, apex)[0, :, :, 0] @ nodes[other]
-        across = np.sum(off * n, axis=-1)
-        gap = np.abs(across) - h
-        over = np.min(np.column_stack([apex, 1 - apex.sum(axis=1)]), axis=1) > 0
-        if np.any(over & (gap < -INSIDE * h)):
-            return None
-        shift = np.where(gap > -INSIDE * h, np.sign(across) * np.maximum(0.0, LEAST * h - gap), 0.0)
-        s = np.maximum(gap, LEAST * h) / np.sqrt(np.linalg.norm(np.cross(J[:, 0], J[:, 1])))
-        X, weights = fans(apex, s)
-        t, q = self._of_first
-        (t_of, q_of), shape = self._of(other, X.reshape(-1, 2)), X.shape[:2]
-        eta = self._heights + (shift / t[one])[:, None]
-        left = Points(T, eta, t[one : one + 1], q[one : one + 1])
-        q_of = q_of.reshape(*shape, -1) * weights[..., None]
-        tables = self._tabulated(X.reshape(-1, 2)).reshape(*shape, 3, -1)
-        layers = np.broadcast_to(self._heights, q_of.shape)
-        return left, Points(tables, layers, t_of.reshape(1, *shape), q_of[None]), (X.reshape(-1, 2), weights.ravel())
+    def _ordered(self, own: range, close: NDArray[np.bool_]) -> tuple[Ints, NDArray[np.bool_]]:
+        """The pairs (n, 2), each once, and which of them are of own cells only."""
+        first, second = np.nonzero(close)
+        first = first + own.start
+        both = (second >= own.start) & (second < own.stop)
+        once = ~both | (first < second)
+        pairs, both = np.column_stack([first, second])[once], both[once]
+        swap = self._order[pairs[:, 0]] > self._order[pairs[:, 1]]
+        pairs[swap] = pairs[swap, ::-1]
+        return pairs, both
 
     def _tabulated(self, X: Array) -> Array:
         """(n, 3, k)"""
         return np.asarray(self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
+
+    def _of(self, cell: int, X: Array) -> tuple[Array, Array]:
+        """Thickness (n,) and charges (n, layers) per area of the reference triangle at places X (n, 2) of a cell."""
+        values = monomials(X, OF_CHARGES)
+        return values @ self._thickness[cell], values @ self._of_copies[cell]
+
+    @cached_property
+    def _cells(self) -> object:
+        rules = [np.column_stack(gauss(n)).ravel() for n in range(1, GAUSS + 1)]
+        arrays = {
+            "shape": of_nodes(self._shape.element),
+            "charges": self._of_copies,
+            "thickness": self._thickness,
+            "heights": self._heights,
+            "T": np.ascontiguousarray(self._tabulated(self._X)),
+            "X": self._X,
+            "weights": self._w,
+            "gauss": np.concatenate(rules),
+        }
+        numbers = {"k": arrays["shape"].shape[1], "degree": self._shape.element.degree, "of_charges": OF_CHARGES}
+        numbers |= {"S": len(self._heights), "P": len(self._w), "h": self._shape.h}
+        return self._pairs.cells(arrays, **numbers, least=LEAST, inside=INSIDE, precision=PRECISION)
 
     @cached_property
     def _heights(self) -> Array:
         return heights(self._faces)
 
     @cached_property
-    def _of_first(self) -> tuple[Array, Array]:
-        """Thickness (cells, n) and charges (cells, n, layers) at points of the first cells, of all copies."""
-        each = [self._of(cell, self._X) for cell in range(len(self._shape.r0) * len(self._copies.images))]
-        t, q = (np.stack(part) for part in zip(*each, strict=True))
-        return t, self._w[:, None] * q
-
-    def _of(self, cell: int, X: Array) -> tuple[Array, Array]:
-        """Thickness (n,) and charges (n, layers) per area of the reference triangle at places X (n, 2) of a cell."""
-        copy, at = divmod(cell, len(self._shape.r0))
-        t = self._copies.up[copy] * self._shape.thickness(np.array([at]), X[None])[0, 0]
-        basis = CHARGES.tabulate(0, X)[0, :, :, 0]
-        return t, self._copies.charges[copy] * (basis @ self._charges[at])
-
-    @cached_property
     def _charges(self) -> Array:
         """(cells, n, layers) charges per area of the reference triangle at nodes of what is modelled."""
         return self._faces.at(*self._nodes_of_charges).q
+
+    @cached_property
+    def _of_copies(self) -> Array:
+        """(copies * cells, monomials, layers) charges."""
+        q = of_nodes(CHARGES) @ self._charges
+        return np.concatenate([factor * q for factor in self._copies.charges])
+
+    @cached_property
+    def _thickness(self) -> Array:
+        """(copies * cells, monomials)"""
+        cells, X = np.arange(len(self._shape.r0)), np.asarray(CHARGES.points)
+        t = self._shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0] @ of_nodes(CHARGES).T
+        return np.concatenate([up * t for up in self._copies.up])
 
     @property
     def _nodes_of_charges(self) -> tuple[Boxes, Array, Array]:

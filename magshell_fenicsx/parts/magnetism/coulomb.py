@@ -36,6 +36,7 @@ PRECISION = 1e-5  # of a pair of cells at their distance
 BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
 FLAT = 0.3  # sine of the angle up to which a cell is beside another: the pole is then beyond the ellipse's end
+ROUNDED = 9  # digits in which areas of parts are compared
 SPACE = 1e-3  # of cells that touch, over their size
 
 
@@ -167,7 +168,11 @@ class Charged:
             self._apart[cell, others] = 0
         self._parts = parts
         assert isinstance(kinds[0].family, Faces)
-        self._close = Close(shape, kinds[0].family, copies, comm, rate(DEGREES[-1]))
+        sizes_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), len(copies.images)))
+        number = np.tile(np.arange(len(shape.r0)), len(copies.images))
+        order = np.empty(len(parts), dtype=np.intp)
+        order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(ROUNDED)])] = np.arange(len(parts))
+        self._close = Close(shape, kinds[0].family, copies, order, comm)
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))
@@ -247,10 +252,9 @@ class Charged:
         if self._near:
             energy += self._near.add(nodes, gradient, stiffness)
         if close.any() and self._kinds[0].faces:
-            of_close = self._close.add(nodes, own, close, gradient, stiffness)
-            if of_close is None:
+            energy += self._close.add(nodes, own, close, gradient, stiffness)
+            if np.isnan(energy):
                 raise Touching
-            energy += of_close
         if stiffness:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
@@ -292,6 +296,11 @@ class Charged:
         if close.any() and self._kinds[0].faces:
             self._close.by_fields(nodes, own, close, moved, weights, into)
         return into
+
+
+def _areas(r0: Array) -> Array:
+    """(cells,) of flat triangles."""
+    return np.asarray(np.linalg.norm(np.cross(r0[:, 1] - r0[:, 0], r0[:, 2] - r0[:, 0]), axis=-1) / 2)
 
 
 def _balls(nodes: Array) -> tuple[Array, Array]:
