@@ -22,19 +22,6 @@ INLINE void monomials(int degree, v x, v y, v *f, v *fx, v *fy)
         }
 }
 
-/* Shape functions and their derivatives T (3, k) from their monomials (.., k). */
-INLINE void shape_functions(int k, int degree, const double *of, v x, v y, v *T)
-{
-    const int count = (degree + 1) * (degree + 2) / 2;
-    v f[3][count];
-    monomials(degree, x, y, f[0], f[1], f[2]);
-    memset(T, 0, 3 * k * sizeof *T);
-    for (int i = 0; i < count; ++i)
-        for (int d = 0; d < 3; ++d)
-            for (int l = 0; l < k; ++l)
-                T[d * k + l] += of[i * k + l] * f[d][i];
-}
-
 typedef struct {
     int64_t count;
     double x[MOST + LANES], y[MOST + LANES], w[MOST + LANES];
@@ -140,14 +127,15 @@ INLINE double dot(const double *a, const double *b)
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/* The foot (2,) of a place on a cell, or on what it would be beyond its sides; a and n as of `surface` there. */
-INLINE void foot_of(const Cells *all, const double *nodes, const double *x, double *foot, double a[3][3], double *n)
+/* The foot (2,) of a place on a cell with monomials (.., 3), or on what it would be beyond its sides; a and n as of
+   `surface` there. */
+INLINE void foot_of(const Cells *all, const double *of, const double *x, double *foot, double a[3][3], double *n)
 {
     const int k = (int)all->k;
     v T[3 * k];
     for (int step = 0;; ++step) {
-        shape_functions(k, (int)all->degree, all->shape, foot[0] + (v){0.0}, foot[1] + (v){0.0}, T);
-        surface(k, T, nodes, a, n);
+        monomials((int)all->degree, foot[0] + (v){0.0}, foot[1] + (v){0.0}, T, T + k, T + 2 * k);
+        surface(k, T, of, a, n);
         if (step == STEPS)
             return;
         const double off[3] = {x[0] - a[0][0], x[1] - a[0][1], x[2] - a[0][2]};
@@ -157,7 +145,7 @@ INLINE void foot_of(const Cells *all, const double *nodes, const double *x, doub
     }
 }
 
-/* What a point p of the first cell, with T there, sees of the second, and how far its charges are shifted along its normal
+/* What a point p of the first cell (k, 3), with T there, sees of the second, by its monomials, and how far its charges are shifted along its normal
    so that faces that press on each other are just apart. The return value is 1 if both are in each other. */
 static int seen(const Cells *all, int64_t p, const v *T, const double *first, const double *second, double t,
                 int64_t other, Fan *to, double *shift)
@@ -194,6 +182,51 @@ INLINE double total(const v *x)
     return sum;
 }
 
+/* The monomials (k, 3) of a cell from its nodes. */
+INLINE void of_monomials(const Cells *all, const double *nodes, double *of)
+{
+    const int k = (int)all->k;
+    memset(of, 0, 3 * k * sizeof *of);
+    for (int i = 0; i < k; ++i)
+        for (int l = 0; l < k; ++l)
+            for (int c = 0; c < 3; ++c)
+                of[3 * i + c] += all->shape[i * k + l] * nodes[3 * l + c];
+}
+
+/* From derivatives by monomials (k, 3) those by nodes, added. */
+INLINE void back(const Cells *all, const v *of, double *to)
+{
+    const int k = (int)all->k;
+    for (int i = 0; i < k; ++i)
+        for (int c = 0; c < 3; ++c) {
+            const double by = total(of + 3 * i + c);
+            for (int l = 0; l < k; ++l)
+                to[3 * l + c] += all->shape[i * k + l] * by;
+        }
+}
+
+/* The same of second derivatives (a <= b, 3, 3). */
+INLINE void back_twice(const Cells *all, const v *of, double *to)
+{
+    const int k = (int)all->k;
+    double full[k][k][9], half[k][k][9];
+    for (int i = 0; i < k; ++i)
+        for (int j = i; j < k; ++j)
+            for (int c = 0; c < 9; ++c, ++of)
+                full[j][i][3 * (c % 3) + c / 3] = full[i][j][c] = total(of);
+    memset(half, 0, sizeof half);
+    for (int i = 0; i < k; ++i)
+        for (int l = 0; l < k; ++l)
+            for (int j = 0; j < k; ++j)
+                for (int c = 0; c < 9; ++c)
+                    half[l][j][c] += all->shape[i * k + l] * full[i][j][c];
+    for (int l = 0; l < k; ++l)
+        for (int m = l; m < k; ++m, to += 9)
+            for (int j = 0; j < k; ++j)
+                for (int c = 0; c < 9; ++c)
+                    to[c] += all->shape[j * k + m] * half[l][j][c];
+}
+
 /* The energy of pairs of cells (count, 2); see `pairs`. It is no number if two are in each other. */
 FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, const double *nodes, double *gradient,
                   double factor, double *onto, double *blocks, const int32_t *where, int64_t columns,
@@ -207,7 +240,9 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
     Fan points;
     for (int64_t pair = 0; pair < count; ++pair) {
         const int64_t one = both[2 * pair], other = both[2 * pair + 1];
-        const double *first = nodes + 3 * k * one, *second = nodes + 3 * k * other;
+        const double *first = nodes + 3 * k * one;
+        double second[3 * k];
+        of_monomials(all, nodes + 3 * k * other, second);
         spread(3 * k, first, XL), spread(3 * k, second, XR);
         memset(&sum, 0, sizeof sum), memset(GL, 0, sizeof GL), memset(GR, 0, sizeof GR);
         memset(HL, 0, sizeof HL), memset(HR, 0, sizeof HR), memset(HX, 0, sizeof HX);
@@ -228,7 +263,7 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
                 v x, y, w;
                 memcpy(&x, points.x + at, sizeof x), memcpy(&y, points.y + at, sizeof y);
                 memcpy(&w, points.w + at, sizeof w);
-                shape_functions(k, (int)all->degree, all->shape, x, y, TR);
+                monomials((int)all->degree, x, y, TR, TR + k, TR + 2 * k);
                 place(k, TR, XR, bent, &right);
                 monomials((int)all->of_charges, x, y, f, 0, 0);
                 polynomial(number, S, all->charges + other * number * S, f, of_right);
@@ -252,13 +287,20 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
         }
         energy += total(&sum);
         for (int l = 0; l < 3 * k; ++l)
-            gradient[3 * k * one + l] += total(GL + l), gradient[3 * k * other + l] += total(GR + l);
+            gradient[3 * k * one + l] += total(GL + l);
+        back(all, GR, gradient + 3 * k * other);
         if (!bent)
             continue;
         for (int l = 0; l < half; ++l)
-            onto[half * one + l] += total(HL + l), onto[half * other + l] += total(HR + l);
-        for (int l = 0; l < 9 * k * k; ++l)
-            H[l] = factor * total(HX + l);
+            onto[half * one + l] += total(HL + l);
+        back_twice(all, HR, onto + half * other);
+        memset(H, 0, sizeof H);
+        for (int row = 0; row < 9 * k; ++row)
+            for (int i = 0; i < k; ++i) {
+                const double of = factor * total(HX + row * k + i);
+                for (int l = 0; l < k; ++l)
+                    H[row * k + l] += of * all->shape[i * k + l];
+            }
         put(k, H, one, other, blocks, where, columns, row_of, column_of, turn + 9 * (one / modelled),
             turn + 9 * (other / modelled));
     }
@@ -272,12 +314,14 @@ int64_t seen_of(const Cells *all, int64_t one, int64_t other, const double *node
 {
     const int k = (int)all->k, number = (int)((all->of_charges + 1) * (all->of_charges + 2) / 2);
     Fan points;
+    double second[3 * k];
+    of_monomials(all, nodes + 3 * k * other, second);
     for (int64_t p = 0; p < all->P; ++p) {
         v T[3 * k], f[number], t;
         spread(3 * k, all->T + 3 * k * p, T);
         monomials((int)all->of_charges, all->X[2 * p] + (v){0.0}, all->X[2 * p + 1] + (v){0.0}, f, 0, 0);
         polynomial(number, 1, all->thickness + one * number, f, &t);
-        if (seen(all, p, T, nodes + 3 * k * one, nodes + 3 * k * other, t[0], other, &points, shift + p))
+        if (seen(all, p, T, nodes + 3 * k * one, second, t[0], other, &points, shift + p))
             return 1;
         count[p] = points.count;
         for (int64_t m = 0; m < points.count; ++m) {
