@@ -26,7 +26,7 @@ from magshell_fenicsx.parts.magnetism.touching import CORNERS, ENDS
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 DEGREE = 14  # of the rule on the first cell
-PRECISION = 1e-6  # of what one of its points sees of the second
+PRECISION = 1e-9  # of what one of its points sees of the second
 GAUSS, MOST = 24, 3 * 24**2  # points of the longest rule, and points that are seen at most, as in close.c
 OF_CHARGES = 5  # degree of charges on a cell
 REACH = 0.25  # of the size of cells: nearer faces are close

@@ -217,7 +217,11 @@ class Pairs:
         """The energy of pairs (n, 2) of cells that are close, as `add`; no number if two are in each other."""
         p, pairs = self._pointer, np.ascontiguousarray(cells)
         matrix = self._matrix(nodes, stiffness)
-        return float(self._lib.close_pairs(of, len(pairs), p(pairs), p(nodes), p(gradient), *matrix)) if len(cells) else 0.0
+        return (
+            float(self._lib.close_pairs(of, len(pairs), p(pairs), p(nodes), p(gradient), *matrix))
+            if len(cells)
+            else 0.0
+        )
 
     def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array] | None:
         """What P points of a cell see of another: places (P, M, 2), weights (P, M), and how far each is shifted (P,).
