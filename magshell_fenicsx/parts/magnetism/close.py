@@ -87,7 +87,7 @@ class Close:
         close, h = np.zeros(apart.shape, dtype=bool), self._shape.h
         middle = nodes.mean(axis=1)
         radius = np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)
-        normal = unit(np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0]))
+        normal = unit(np.asarray(np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0]), dtype=np.float64))
         first, second = np.nonzero(apart)
         c = first + own.start
         size = 2 * np.maximum(radius[c], radius[second])
