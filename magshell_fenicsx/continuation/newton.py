@@ -194,9 +194,7 @@ class BorderedNewton:
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         if (moved and fresh) or self._tangent.rough:
-            refined = refined_tangent(
-                self.system, matrix, tangent, state, load, row, foreseeing=self._tangent.foresees
-            )
+            refined = refined_tangent(self.system, matrix, tangent, state, load, row, foreseeing=self._tangent.foresees)
             if refined is None:
                 return self.response(state, name, row, anew=True)
             tangent = refined
