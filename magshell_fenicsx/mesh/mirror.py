@@ -224,7 +224,7 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
     Raises
     ------
     MeshError
-        If triangles lie across a plane.
+        If triangles lie across a plane, or in it.
     """
     for name, plane in mirror.sides.items():
         patch = _halved(patch, plane, name)
@@ -236,7 +236,8 @@ def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
     kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
     corners = np.where(kept[:, None], beyond[patch.cells[:, :3]], -beyond[patch.cells[:, :3]])
-    if kept.all() or not kept.any() or corners.min() < -ROUNDING * extent:
+    across = corners.min() < -ROUNDING * extent or corners.max(axis=1).min() <= ROUNDING * extent
+    if kept.all() or not kept.any() or across:
         raise MeshError(
             f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"
         )

@@ -59,10 +59,13 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
     model.mesh.setOrder(order)
 
 
-def test_no_mirror_through_triangles() -> None:
-    """A triangle that is its own image lies on neither side of the plane: half of it would be lost."""
-    nodes = np.array([[-1.0, 0, 0], [1, 0, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0]])
-    patch = PatchMesh(nodes, np.array([[0, 1, 3], [0, 3, 2], [1, 4, 3]]), lambda x: x)
+@pytest.mark.parametrize("cells", [[[0, 1, 3], [0, 3, 2], [1, 4, 3]], [[3, 2, 0], [3, 1, 4], [5, 6, 7]]])
+def test_no_mirror_through_triangles(cells: list[list[int]]) -> None:
+    """A triangle that is its own image, across the plane or in it, lies on neither side: it would be lost."""
+    web = [[0.0, 0, 1], [0, 1, 1], [0, 0.5, 2]]
+    nodes = np.array([[-1.0, 0, 0], [1, 0, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0], *web])
+    nodes = nodes[: np.max(cells) + 1]
+    patch = PatchMesh(nodes, np.array(cells), lambda x: x)
     assert not mesh_mirrors(patch, [], loosely=True)
     with pytest.raises(MeshError, match="no edges of the mesh lie in the plane"):
         cut(patch, Mirror(np.array([1.0, 0, 0])))
