@@ -191,7 +191,8 @@ class Charged:
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
         apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
-        close = self._close.of(nodes, own, apart)
+        others = self._parts[own.start : own.stop, None] != self._parts
+        close = self._close.of(nodes, own, apart & others)
         apart &= ~close
         rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
         if rules is None:
