@@ -234,9 +234,10 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
 def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     places = patch.embedding(patch.nodes)
     beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
-    kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
-    corners = np.where(kept[:, None], beyond[patch.cells[:, :3]], -beyond[patch.cells[:, :3]])
-    across = corners.min() < -ROUNDING * extent or corners.max(axis=1).min() <= ROUNDING * extent
+    corners = beyond[patch.cells[:, :3]]
+    kept = corners.mean(axis=1) > 0
+    within = np.where(kept[:, None], corners, -corners)  # how far on their own side of the plane
+    across = within.min() < -ROUNDING * extent or within.max(axis=1).min() <= ROUNDING * extent
     if kept.all() or not kept.any() or across:
         raise MeshError(
             f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"

@@ -98,6 +98,12 @@ typedef struct {
     double h, least, inside, precision;
 } Cells;
 
+/* The number of monomials of charges and of the thickness. */
+INLINE int number_of(const Cells *all)
+{
+    return (int)((all->of_charges + 1) * (all->of_charges + 2) / 2);
+}
+
 /* A polynomial (.., step) of lanes. */
 INLINE void polynomial(int count, int64_t step, const double *of, const v *f, v *value)
 {
@@ -145,12 +151,13 @@ INLINE void foot_of(const Cells *all, const double *of, const double *x, double 
     }
 }
 
-/* What a point p of the first cell (k, 3), with T there, sees of the second, by its monomials, and how far its charges are shifted along its normal
-   so that faces that press on each other are just apart. The return value is 1 if both are in each other. */
-static int seen(const Cells *all, int64_t p, const v *T, const double *first, const double *second, double t,
+/* What a point of the first cell (k, 3), with T there, sees of the second, by its monomials, and how far its charges are
+   shifted along its normal so that faces that press on each other are just apart. The return value is 1 if both are in
+   each other. */
+static int seen(const Cells *all, const v *T, const double *first, const double *second, double t,
                 int64_t other, Fan *to, double *shift)
 {
-    const int count = (int)((all->of_charges + 1) * (all->of_charges + 2) / 2);
+    const int count = number_of(all);
     double a[3][3], n[3], b[3][3], m[3], x[3], foot[2] = {1.0 / 3.0, 1.0 / 3.0};
     surface((int)all->k, T, first, a, n);
     foot_of(all, second, a[0], foot, b, m);
@@ -233,7 +240,7 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
                   const int64_t *row_of, const int64_t *column_of, const double *turn, int64_t modelled)
 {
     const int k = (int)all->k, half = 9 * k * (k + 1) / 2, bent = onto != 0, S = (int)all->S;
-    const int number = (int)((all->of_charges + 1) * (all->of_charges + 2) / 2);
+    const int number = number_of(all);
     double energy = 0.0, H[bent ? 9 * k * k : 1], heights[S];
     v XL[3 * k], XR[3 * k], GL[3 * k], GR[3 * k], TL[3 * k], TR[3 * k], A[9 * k], B[9 * k], q[S], of_right[S], f[number];
     v HL[bent ? half : 1], HR[bent ? half : 1], HX[bent ? 9 * k * k : 1], X[24], sum, thick;
@@ -254,7 +261,7 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
             polynomial(number, S, all->charges + one * number * S, f, q);
             polynomial(number, 1, all->thickness + one * number, f, &left.t);
             double shift;
-            if (seen(all, p, TL, first, second, left.t[0], other, &points, &shift))
+            if (seen(all, TL, first, second, left.t[0], other, &points, &shift))
                 return NAN;
             for (int s = 0; s < S; ++s)
                 q[s] *= all->weights[p], heights[s] = all->heights[s] + shift / left.t[0];
@@ -312,7 +319,7 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
 int64_t seen_of(const Cells *all, int64_t one, int64_t other, const double *nodes, int64_t most, int64_t *count,
                 double *x, double *w, double *shift)
 {
-    const int k = (int)all->k, number = (int)((all->of_charges + 1) * (all->of_charges + 2) / 2);
+    const int k = (int)all->k, number = number_of(all);
     Fan points;
     double second[3 * k];
     of_monomials(all, nodes + 3 * k * other, second);
@@ -321,7 +328,7 @@ int64_t seen_of(const Cells *all, int64_t one, int64_t other, const double *node
         spread(3 * k, all->T + 3 * k * p, T);
         monomials((int)all->of_charges, all->X[2 * p] + (v){0.0}, all->X[2 * p + 1] + (v){0.0}, f, 0, 0);
         polynomial(number, 1, all->thickness + one * number, f, &t);
-        if (seen(all, p, T, nodes + 3 * k * one, second, t[0], other, &points, shift + p))
+        if (seen(all, T, nodes + 3 * k * one, second, t[0], other, &points, shift + p))
             return 1;
         count[p] = points.count;
         for (int64_t m = 0; m < points.count; ++m) {

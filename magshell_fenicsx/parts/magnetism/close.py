@@ -117,7 +117,7 @@ class Close:
         self, nodes: Array, own: range, close: NDArray[np.bool_], moved: Complex, weights: Weights, into: Nodal
     ) -> None:
         """Add the derivatives that `into` has, of own cells: see `Charged.by_fields`."""
-        on_charges, row = np.zeros_like(self._charges), np.zeros(1, dtype=np.int64)
+        on_charges, row, basis = np.zeros_like(self._charges), np.zeros(1, dtype=np.int64), of_nodes(CHARGES)
         for one, other in self._ordered(own, close)[0]:
             seen = self._pairs.seen(self._cells, nodes, one, other, MOST)
             if seen is None:
@@ -138,7 +138,7 @@ class Close:
                     continue
                 copy, number = divmod(cell, len(self._shape.r0))
                 on = self._copies.charges[copy] * weight[:, None] * on_q[i].reshape(len(at), -1)
-                on_charges[number] += (monomials(at, OF_CHARGES) @ of_nodes(CHARGES)).T @ on
+                on_charges[number] += (monomials(at, OF_CHARGES) @ basis).T @ on
                 if on_heights:
                     on_t = self._copies.up[copy] * (on_heights[i].reshape(len(at), -1) @ self._heights)
                     self._shape.back_of_thickness(np.array([number]), at, on_t[None], into)

@@ -162,7 +162,8 @@ class Charged:
         kinds += [Kind(shape, cells[edges == edge], copies, edge) for edge in range(3) if (edges == edge).any()]
         sizes = [kind.charged(0) for kind in kinds]
         self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if may or size > NOTHING * max(sizes)]
-        self._apart = np.array(parts[:, None] != parts, dtype=np.uint8)
+        self._others = np.asarray(parts[:, None] != parts)  # pairs of different parts
+        self._apart = self._others.astype(np.uint8)
         for cell, others in enumerate(near.touching if near else ()):
             self._apart[cell] = 1
             self._apart[cell, others] = 0
@@ -191,8 +192,7 @@ class Charged:
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
         apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
-        others = self._parts[own.start : own.stop, None] != self._parts
-        close = self._close.of(nodes, own, apart & others)
+        close = self._close.of(nodes, own, apart & self._others[own.start : own.stop])
         apart &= ~close
         rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
         if rules is None:
