@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+GROWN = 2.0  # times as long as the one before, a step leads away
 FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
@@ -110,7 +111,7 @@ class Iterates:
         stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
-        if step.own and len(before) > 2 and full and step.size > 2 * full[-1] and not self.searched:
+        if step.own and len(before) > 2 and full and step.size > GROWN * full[-1] and not self.searched:
             return "diverged"
         if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
@@ -118,6 +119,7 @@ class Iterates:
 
     def _astray(self, before: Sequence[Step], step: Step) -> bool:
         """Whether steps with matrices of their own lead away, past an instability, or stay long."""
-        if len(before) == 1:
-            return step.size > FULL * before[0].size and step.pivots != before[0].pivots
+        if len(before) == 1 and step.pivots != before[0].pivots:
+            past = step.pivots > before[0].pivots  # a shorter step of the path sees the instability, too
+            return step.size > (FULL if past else GROWN) * before[0].size
         return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
