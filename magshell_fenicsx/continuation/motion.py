@@ -108,6 +108,9 @@ class Averaged(Protocol):
     def present(self) -> None:
         """Let the system have the forces of its state again."""
 
+    def passes(self, begin: State, end: State) -> str:
+        """What passes through each other in a step, in words; empty if nothing does."""
+
     def stored(self, u: Vector, mu: Amplitudes) -> float:
         """The energy without the potentials of loads."""
 

@@ -125,7 +125,8 @@ class Integrator:
         self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
-        self._K: PETSc.Mat | None = None
+        self._K: PETSc.Mat | None = None  # of the pattern of another one, which contact of shells changes
+        self._like: PETSc.Mat | None = None
         self.factored: Factored | None = None
         self._x, self._y = mass.createVecs()
         # what a state has from its history: turns of edges under moments, whose work is counted on
@@ -247,6 +248,9 @@ class Integrator:
             tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
             stalled = size <= STALLED and size > last / 2 and fresh
             if size <= tolerance or (stalled and size <= ROUNDED * self._rounding(now, u, y, dt)):
+                end = State(u, self._at(now, y, 1.0, dt))
+                if self.averaged and (passed := self.averaged.passes(State(now.u, now.mu), end)):
+                    return passed
                 self.steps += 1
                 return self._accepted(now, u, y, dt)
             if size > SLOW * last:
@@ -336,8 +340,8 @@ class Integrator:
         tangent = self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed | Beside) else tangent
-        if self._K is None:
-            self._K = K.duplicate()
+        if self._like is None or self._K is None or self._like.handle != K.handle:
+            self._like, self._K = K, K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._K.scale(part)

@@ -136,7 +136,7 @@ def _recorded(scene: Scene, step: ProgrammeStep, record: Record, remark: Callabl
     at = record.scene or scene
     if record.said:
         remark(where + record.said)
-    refuse_penetration(at, record.point.state)
+    refuse_penetration(at, record.point.state, moving=bool((record.clock or {}).get("kinetic")))
     return replace(record, step=step.number, scene=at, shown=at.displacement)
 
 

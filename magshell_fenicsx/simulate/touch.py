@@ -28,6 +28,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+IMPACT = 10.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
@@ -69,17 +70,23 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
 
     None if none does, or if its stiffness is given.
     """
-    state, h, raised = stage.leave(high.state), stage.scene.problem.material.h, dict[str, float]()
-    for contact in stage.scene.problem.loads.contacts:
+    raised = stiffnesses(stage.scene, stage.leave(high.state))
+    return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+
+
+def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
+    """The settings of what penetrates too much at a state, `STIFFER` times as stiff; of a given stiffness none."""
+    h, raised = scene.problem.material.h, dict[str, float]()
+    for contact in scene.problem.loads.contacts:
         k = state.mu.get(contact.setting, contact.stiffness)
-        deep = stage.scene.model.region(state, contact.amplitude).penetration
+        deep = scene.model.region(state, contact.amplitude).penetration
         if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
             raised[contact.setting] = STIFFER * k
-    for pair, deep in between(stage.scene, state):
+    for pair, deep in between(scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
         if deep > NEARLY * pair.bound * h and k < AT_A_CORNER * pair.stiffness:
             raised[pair.setting] = STIFFER * k
-    return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+    return raised
 
 
 def recut(stage: Stage, low: Point, high: Point) -> State | None:
@@ -202,8 +209,8 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
             raise PathStopped(said, high, final=True)
 
 
-def refuse_penetration(scene: Scene, state: State) -> None:
-    """See that no body penetrates more than its bound.
+def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> None:
+    """See that no body penetrates more than its bound, and no shell; where these hit each other in a motion, `IMPACT`.
 
     Raises
     ------
@@ -220,9 +227,10 @@ def refuse_penetration(scene: Scene, state: State) -> None:
                 f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
             )
     for pair, deep in between(scene, state):
-        if deep > pair.bound * h:
+        bound = pair.bound * (IMPACT if moving else 1.0)
+        if deep > bound * h:
             raise Stopped(
-                f"the penetration between {pair.words} is {deep / h:.3g} h, more than {pair.bound:g} h even with the "
+                f"the penetration between {pair.words} is {deep / h:.3g} h, more than {bound:g} h even with the "
                 "stiffest penalty: take smaller elements where they touch"
             )
 

@@ -9,21 +9,24 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.moving import in_space
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
-from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.bodies.contact import Pressings
+from magshell_fenicsx.parts.bodies.contact import Pressing
 from magshell_fenicsx.parts.course import SnapSection
 from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
 from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection, level_in
+from magshell_fenicsx.parts.touching.in_steps import InSteps, looks_of_step
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.turning import vectors_of
 from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
@@ -33,8 +36,10 @@ from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
+from magshell_fenicsx.simulate.touch import stiffnesses
 from magshell_fenicsx.simulate.walked import Records
 
+Array = NDArray[np.float64]
 SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
 CLOSE = 1e-5  # of the shortest time of a history: a difference by time
 SAME = 1e-9
@@ -138,6 +143,68 @@ class LoadsInTime:
 
 
 @dataclass(frozen=True)
+class _Ends:
+    """Where bodies press, and the displacements of shells that may touch, at one end of a step."""
+
+    of_bodies: list[tuple[Array, float | Array]]
+    of_shells: list[Array]
+
+
+class Pressings:
+    """All contacts of a system in steps in time, with bodies and between shells; a `continuation.motion.Averaged`.
+
+    Attributes
+    ----------
+    names
+        The approaches.
+    """
+
+    def __init__(
+        self, system: FiniteElementSystem, pressings: Mapping[str, Pressing], between: Sequence[InSteps]
+    ) -> None:
+        self._system, self._pressings, self._between = system, list(pressings.values()), between
+        self.names = frozenset(pressings)
+        self._begin: tuple[Vector, _Ends] | None = None
+
+    def along(self, begin: State, end: State, part: float) -> None:
+        """Take the forces of a step at a part of it."""
+        before, after = self._at_begin(begin), self._places(end)
+        for pressing, low, high in zip(self._pressings, before.of_bodies, after.of_bodies, strict=True):
+            pressing.average(low, high, part)
+        for contact, u, v in zip(self._between, before.of_shells, after.of_shells, strict=True):
+            contact.looks = ()
+            contact.looks = looks_of_step(contact, u, v, part)
+
+    def present(self) -> None:
+        """Take the present forces again."""
+        for pressing in self._pressings:
+            pressing.present()
+        for contact in self._between:
+            contact.looks = ()
+
+    def passes(self, begin: State, end: State) -> str:
+        """Which shells pass through each other in a step."""
+        ends = zip(self._between, self._at_begin(begin).of_shells, self._places(end).of_shells, strict=True)
+        through = [contact.pair.words for contact, before, after in ends if contact.passes(before, after)]
+        return f"{through[0]} pass through each other" if through else ""
+
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """The energy of the shell itself with that of the contacts."""
+        self.present()
+        return self._system.stored(u, mu)
+
+    def _at_begin(self, begin: State) -> _Ends:
+        if self._begin is None or self._begin[0] is not begin.u:
+            self._begin = begin.u, self._places(begin)
+        return self._begin[1]
+
+    def _places(self, state: State) -> _Ends:
+        return self._system.at(state).of(
+            lambda: _Ends([each.where for each in self._pressings], [each.where for each in self._between])
+        )
+
+
+@dataclass(frozen=True)
 class Moving(State):
     """A state with a velocity, and perhaps one of its supports."""
 
@@ -177,7 +244,8 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
                 system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried
             )
         pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
-        touching = Pressings(system, pressings) if pressings else None
+        between = scene.model.touchings
+        touching = Pressings(system, pressings, between) if pressings or between else None
         integrator = Integrator(
             system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
         )
@@ -300,10 +368,17 @@ def _rest(scene: Scene, held: Mapping[str, Held], state: State) -> State | None:
     """The equilibrium near a state; None if there is none near, or an unstable one."""
     stage = staged(scene, state, held)
     start = stage.enter(state)
-    start = start.with_(start.u, IDLE, 0.0)
-    outcome = stage.newton.solve(start, IDLE, GivenLoad(IDLE, 0.0))
-    moved = max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
-    if not outcome.converged or moved > NEAR or stage.newton.factor_at(outcome.state).negative_pivots:
+    start, raised = start.with_(start.u, IDLE, 0.0), dict[str, float]()
+    while True:
+        outcome = stage.newton.solve(start, IDLE, GivenLoad(IDLE, 0.0))
+        moved = max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
+        if not outcome.converged or moved > NEAR:
+            return None
+        stiffer = stiffnesses(scene, at_rest := stage.leave(outcome.state))
+        if not stiffer:
+            break
+        raised |= stiffer
+        start = State(outcome.state.u, {**outcome.state.mu, **raised})
+    if stage.newton.factor_at(outcome.state).negative_pivots:
         return None
-    at_rest = stage.leave(outcome.state)
-    return State(at_rest.u, state.mu | {name: at_rest.mu[name] for name in held})
+    return State(at_rest.u, state.mu | {name: at_rest.mu[name] for name in (*held, *raised)})

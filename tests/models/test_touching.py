@@ -238,8 +238,7 @@ def test_a_step_that_passes_through() -> None:
             {"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}},
             "contact: needs the same thickness everywhere; leave out shell.thickness_factor",
         ),
-        ({"loading": {"kind": "time", "duration": 1}}, "kind: time: with contact, steps in time do not know it"),
-        ({"loading": {"kind": "pressure", "until": "limit", "then": "snap"}}, "then: with contact between shells"),
+        ({"loading": {"kind": "pressure", "until": "bifurcation", "then": "follow"}}, "then: follow: with contact"),
         ({"loading": {"kind": "pressure", "search": {}}}, "search: with contact between shells"),
     ],
 )

@@ -7,7 +7,7 @@ y has the derivatives of the penalty itself, by the displacement and by the appr
 the thickness varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the polynomial.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import basix
@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
 from magshell_fenicsx.parts.gap import SOFT, Thinning, mean_pressure, penalty, thinned
@@ -394,37 +392,3 @@ class Pressing:
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
         return Region(penetration, radius, inner if most else 0.0, outer)
-
-
-class Pressings:
-    """All contacts of a system in steps in time; a `continuation.transient.Averaged`.
-
-    Attributes
-    ----------
-    names
-        The approaches.
-    """
-
-    def __init__(self, system: FiniteElementSystem, pressings: Mapping[str, Pressing]) -> None:
-        self._system, self._pressings, self.names = system, list(pressings.values()), frozenset(pressings)
-        self._begin: tuple[Vector, list[tuple[Array, float | Array]]] | None = None
-
-    def along(self, begin: State, end: State, part: float) -> None:
-        """Take the forces of a step at a part of it, see `Pressing.average`."""
-        if self._begin is None or self._begin[0] is not begin.u:
-            self._begin = begin.u, self._places(begin)
-        for pressing, before, after in zip(self._pressings, self._begin[1], self._places(end), strict=True):
-            pressing.average(before, after, part)
-
-    def present(self) -> None:
-        """Take the present forces again."""
-        for pressing in self._pressings:
-            pressing.present()
-
-    def _places(self, state: State) -> list[tuple[Array, float | Array]]:
-        return self._system.at(state).of(lambda: [pressing.where for pressing in self._pressings])
-
-    def stored(self, u: Vector, mu: Amplitudes) -> float:
-        """The energy of the shell itself with that of the contacts."""
-        self.present()
-        return self._system.stored(u, mu)

@@ -23,6 +23,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
+from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
 from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, ROUNDS
 from magshell_fenicsx.parts.touching.rules import BEFORE
 from magshell_fenicsx.parts.touching.section import Pair
@@ -112,6 +113,9 @@ class MeridianTouching:
         self._normals = self._cell_normals()
         self._at: Array = np.full_like(self._r0, np.nan)
         self._places = _nowhere()
+        self.looks: Sequence[Look] = ()  # see `InSteps`
+        self.look: Look | None = None
+        self._looked_at = Kept[tuple[Array, Faced]]()
         k = self._element.degree
         self._start = np.linspace(0.0, 1.0, START * k + 1, dtype=np.float64)
 
@@ -133,18 +137,26 @@ class MeridianTouching:
         return float(self._rule.weight[at.point] @ self._penalty(at)[0]) / 2
 
     def add_residual(self, b: Array, factor: float) -> None:
+        forces = np.sum(of_each(self, self._forces), axis=0)
+        b[: forces.size] += factor * forces.ravel()
+
+    def _forces(self) -> Array:
         at = self._pressed()
         weight = self._rule.weight[at.point] / 2 * self._penalty(at)[1]
         _, n, beta, nodes = self._geometry(at)
         forces = np.zeros_like(self._r0)
         np.add.at(forces, nodes, -(weight[:, None] * beta)[..., None] * n[:, None])
-        b[: forces.size] += factor * forces.ravel()
+        return forces
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
         """See `Coupled`."""
+        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def _entries(self) -> Entries:
         H, nodes = self._second(0.0)
         of_plane = np.flatnonzero(np.arange(H.shape[1]) % 3 != 1)
         return _entries(H[:, of_plane[:, None], of_plane], nodes, 2)
@@ -223,21 +235,42 @@ class MeridianTouching:
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * self._h)))
         return any(len(self._found(u + k / looks * (v - u), NEARER * self._h).point) for k in range(1, looks))
 
+    # in a step in time, see `in_steps.InSteps`
+
+    passes = through
+
+    @property
+    def where(self) -> Array:
+        """The displacement of all nodes."""
+        return np.array(self._now())
+
+    def along(self, moved: Array) -> Along:
+        """See `InSteps`."""
+        at = self._pressed()
+        _, n, beta, nodes = self._geometry(at)
+        moves = -np.einsum("nk,ni,nki->n", beta, n, moved[nodes])
+        deep, soft = self._h - at.distance, SOFT * self._h
+        return Along.of(len(self._rule.weight), at.point, deep, moves, self.stiffness.value, soft)
+
     # geometry
 
     def _now(self) -> Array:
-        return np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
+        return self.look.u if self.look else np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
 
     def _pressed(self) -> Faced:
         """The places that are pressed at the present state."""
         u = self._now()
         if not np.array_equal(u, self._at):
-            at = self._found(u, self._h)
-            self._at, self._places = np.array(u), at.of(~self._left_to_edges(at))
+            self._at, self._places = self._looked_at.of((u,), lambda: self._facing(np.array(u)))
         return self._places
 
+    def _facing(self, u: Array) -> tuple[Array, Faced]:
+        at = self._found(u, self._h)
+        return u, at.of(~self._left_to_edges(at))
+
     def _penalty(self, at: Faced) -> tuple[Array, Array, Array]:
-        return penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
+        pressed = penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
+        return self.look.of(at.point, pressed) if self.look else pressed
 
     def _points(self, count: int) -> Rule:
         """So many Gauss's points in each cell, in those with a free end the end among them."""

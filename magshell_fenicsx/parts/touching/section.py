@@ -171,15 +171,15 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
 
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
-    grows = bool(step.load.multiplies(step, context))
-    for refused, why in ((step.load.in_time, "steps in time do not know it"), (grows, "undeformed gaps would change")):
-        if refused:
-            raise ValueError(f"{step.key}.kind: {step.kind}: with contact, {why}: take steps along a path")
+    if step.load.multiplies(step, context):
+        said = "with contact, undeformed gaps would change: take steps along a path"
+        raise ValueError(f"{step.key}.kind: {step.kind}: {said}")
     if getattr(step.load, "search", None):
         raise ValueError(f"{step.key}.search: with contact between shells it is not built: leave it out")
-    if getattr(step.load, "then", None) or getattr(step.load, "sensitivities", False):
-        key = "then" if getattr(step.load, "then", None) else "sensitivities"
-        raise ValueError(f"{step.key}.{key}: with contact between shells it is not built: leave it out")
+    if getattr(step.load, "then", None) == "follow":
+        raise ValueError(f"{step.key}.then: follow: with contact between shells it is not built: leave it out")
+    if getattr(step.load, "sensitivities", False):
+        raise ValueError(f"{step.key}.sensitivities: with contact between shells it is not built: leave it out")
 
 
 def account(context: Context, loads: "Loads") -> Account:

@@ -31,6 +31,7 @@ from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
+from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
 from magshell_fenicsx.parts.touching.nearest import (
     SIGNS,
     Cells,
@@ -126,6 +127,9 @@ class Touching:
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
+        self.looks: Sequence[Look] = ()  # see `InSteps`
+        self.look: Look | None = None
+        self._looked_at = Kept[tuple[Places, Places, Joined]]()
 
     # as a term
 
@@ -145,12 +149,17 @@ class Touching:
         return float(self._points.weight[at.point[joined.first]] @ value) / 2
 
     def add_residual(self, b: Array, factor: float) -> None:
-        self._add(b, factor * self._on_nodes(self._forces()))
+        of_looks = of_each(self, lambda: self._on_nodes(self._forces()))
+        self._add(b, factor * np.sum(of_looks, axis=0))
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
+        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def _entries(self) -> Entries:
         entries = self._by_parts()
         return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
 
@@ -312,7 +321,10 @@ class Touching:
 
         Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
-        u, v = self._of_copies(u), self._of_copies(v)
+        return self.passes(self._of_copies(u), self._of_copies(v))
+
+    def passes(self, u: Array, v: Array) -> bool:
+        """The same of displacements of all that is faced."""
         moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
@@ -323,6 +335,24 @@ class Touching:
             if self._comm.allreduce(len(near.point)):
                 return True
         return False
+
+    # in a step in time, see `in_steps.InSteps`
+
+    @property
+    def where(self) -> Array:
+        """The displacement of all that is faced; collective."""
+        return np.array(self._now())
+
+    def along(self, moved: Array) -> Along:
+        """See `InSteps`."""
+        at, joined, _ = self._pressed()
+        if self._faces:
+            moved = np.column_stack([moved, self._faces.half(self._at + moved) - self._faces.half(self._at)])
+        _, n, beta, nodes = self._geometry(at)
+        moves = -np.einsum("nki,nki->n", slope_of(n, beta, self._parts), moved[nodes])
+        moves = np.bincount(joined.group, joined.weight * moves, len(joined.first))
+        point, k = at.point[joined.first], self.stiffness.value
+        return Along.of(len(self._points.weight), point, self._h - joined.distance, moves, k, SOFT * self._h)
 
     # its history
 
@@ -366,7 +396,7 @@ class Touching:
     # geometry
 
     def _now(self) -> Array:
-        return self._u()
+        return self.look.u if self.look else self._u()
 
     def _of_copies(self, u: Array) -> Array:
         """The displacement of all that is faced, of the nodes that are modelled."""
@@ -389,12 +419,17 @@ class Touching:
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
             self._points, self._grown, self._at = points, grown, np.array(u)
-            places = self._facing.found(u, (1 + SAME) * self._h, points)
-            left = self._facing.left_to_edges(points, places, normals)
-            self._places, self._left = places.of(~left), places.of(left)
-            self._joined = Joined.of(self._places, BLUR * self._h)
+            kept = self._looked_at.of((u, self.cuts.value, grown), lambda: self._faced(points, normals, u))
+            self._places, self._left, self._joined = kept
         joined = self._joined
-        return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
+        pressed = penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
+        return self._places, joined, self.look.of(self._places.point[joined.first], pressed) if self.look else pressed
+
+    def _faced(self, points: Points, normals: Array, u: Array) -> tuple[Places, Places, Joined]:
+        """The places that count, those left to edges, and how the former are joined."""
+        places = self._facing.found(u, (1 + SAME) * self._h, points)
+        left = self._facing.left_to_edges(points, places, normals)
+        return places.of(~left), places.of(left), Joined.of(places.of(~left), BLUR * self._h)
 
     def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
         """What the Hessian of joined places has besides those of each."""

@@ -1,0 +1,85 @@
+"""Shells that hit each other in time: forces of a step, the balance of energy, and where a motion ends."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
+from magshell_fenicsx.runs.rows import rows
+from magshell_fenicsx.simulate.follow import follow
+
+Array = NDArray[np.float64]
+DISC = {
+    "geometry": "disc", "radius": "50 mm", "thickness": "1 mm",
+    "poisson_ratio": 0.3, "youngs_modulus": "1 MPa", "density": "1000 kg/m^3",
+}  # fmt: skip
+DISCS: dict[str, Any] = {
+    "shells": {
+        "low": {"shell": DISC, "boundary": {"rim": "clamped"}},
+        "high": {"shell": DISC, "boundary": {"rim": "clamped"}, "place": {"position": ["0 mm", "0 mm", "1.5 mm"]}},
+    },
+    "contact": [["low", "high"]],
+}
+CLAP = "-0.05*(1 - (x**2 + y**2)/0.0025)**2*(z - 0.00075)/0.00075"  # towards each other
+THROWN = {"kind": "time", "velocity": ["0", "0", CLAP], "rho_inf": 1.0, "step": 2e-3, "duration": 1e-2, "points": 5}
+MESHES = {"axisymmetric": {"degree": 3, "refinement": 0.3}, "half": {"degree": 2, "refinement": 0.2}}
+
+
+def found_of(base: dict[str, Any]) -> list[dict[str, Any]]:
+    scene = Scene(Case.from_source(Source("test", base)))
+    return rows(scene, follow(scene))
+
+
+@pytest.mark.parametrize("symmetry", MESHES)
+@pytest.mark.parametrize("ends", [(0.2, 0.29), (0.29, 0.24), (0.29, 0.2902), (0.24, 0.3)])
+def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(symmetry: str, ends: tuple[float, float]) -> None:
+    """Where contact sets in, ceases and goes on: 1e-9 of the larger energy; differences of the force: 1e-3 of its
+    tangent, of which the geometric part of a kink is left out, and nearer where that is small."""
+    steps = {"loading": [{"kind": "time", "duration": 1.0, "points": 1}], "symmetry": symmetry}
+    scene = Scene(Case.from_source(Source("test", DISCS | steps | {"mesh": MESHES[symmetry]})))
+    (contact,), h = scene.model.touchings, scene.model.material.h
+    r = contact._r0
+
+    def clapped(w: float, seed: int) -> Array:
+        u, bump = np.zeros_like(r), (1 - np.sum(r[:, :-1] ** 2, axis=1)) ** 2
+        u[:, -1] = np.where(r[:, -1] > 0.75 * h, -1.0, 1.0) * w * h * bump
+        return u + 1e-5 * h * np.random.default_rng(seed).standard_normal(u.shape)
+
+    def force(end: Array, part: float) -> Array:
+        contact.looks = ()
+        contact.looks = looks_of_step(contact, begin, end, part)
+        return np.sum(of_each(contact, contact._forces), axis=0)[:, : r.shape[1]]
+
+    def energy(u: Array) -> float:
+        contact.looks, contact.look = (), Look(u)
+        try:
+            return contact.energy()
+        finally:
+            contact.look = None
+
+    begin, end = clapped(ends[0], 0), clapped(ends[1], 1)
+    energies = energy(begin), energy(end)
+    assert max(energies) > 0
+    assert np.sum(force(end, 0.5) * (end - begin)) == pytest.approx(energies[1] - energies[0], abs=1e-9 * max(energies))
+    v = 1e-7 * h * np.random.default_rng(3).standard_normal(r.shape)
+    force(end, 0.6)
+    i, j, values = map(np.concatenate, zip(*of_each(contact, contact._entries, tangent=True), strict=True))
+    expected = 0.6 * times([(1.0, (i, j, values))], v.ravel())
+    change = (force(end + v / 2, 0.6) - force(end - v / 2, 0.6)).ravel()
+    contact.looks = ()
+    assert np.abs(change).max() > 0
+    assert np.abs(change - expected).max() < 1e-3 * np.abs(change).max()
+
+
+@pytest.mark.parametrize("symmetry", MESHES)
+def test_two_plates_that_clap_conserve_energy(symmetry: str) -> None:
+    """With rho_inf: 1 nothing is lost but by bending, whose energy is no quartic; both are in contact at a row."""
+    found = found_of(DISCS | {"loading": [THROWN], "symmetry": symmetry, "mesh": MESHES[symmetry]})
+    assert max(row["contact_force"] for row in found) > 0
+    for row in found[1:]:
+        assert abs(row["imbalance"]) < 1e-6 * (row["kinetic"] + row["stored"])
