@@ -172,8 +172,8 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
     if step.load.multiplies(step, context):
-        said = "with contact, undeformed gaps would change: take steps along a path"
-        raise ValueError(f"{step.key}.kind: {step.kind}: {said}")
+        said = f"{step.key}.kind: {step.kind}"
+        raise ValueError(f"{said}: with contact, undeformed gaps would change: take steps along a path")
     if getattr(step.load, "search", None):
         raise ValueError(f"{step.key}.search: with contact between shells it is not built: leave it out")
     if getattr(step.load, "then", None) == "follow":
