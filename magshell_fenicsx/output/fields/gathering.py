@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
-from magshell_fenicsx.output.fields.surface import PRESSURE, SHELL, W0, Surface, SurfaceGatherer, grown
+from magshell_fenicsx.output.fields.surface import GAP, PRESSURE, SHELL, W0, Surface, SurfaceGatherer, grown
 from magshell_fenicsx.shells.revolution import ENDS, Revolution
 
 if TYPE_CHECKING:  # one of them is built
@@ -97,6 +97,10 @@ class RevolvedGatherer:
         pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
+        gap = self._model.cell_gaps(state) if state.mu else None
+        if gap is not None:
+            of_shells = np.repeat(gap[swept.order, None] / self._model.material.h, 2, axis=1)
+            values[GAP] = np.minimum(values.get(GAP, np.inf), of_shells)
         values |= rubber_fields(values, self._law)
         turned = self._around(values)
         fields = self._constant | turned

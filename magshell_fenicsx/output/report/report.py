@@ -46,7 +46,7 @@ PICTURES = {  # in the order of the report
     "strains.png": "Strains of the mid-surface at the last point.",
     "stretches.png": "Stretches of the mid-surface and true stresses at the last point.",
     "moments.png": "Bending moments at the last point.",
-    "contact.png": "Gap and contact pressure of the bodies at the last point.",
+    "contact.png": "Gap and contact pressure at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
     "gradients.png": "Where a result would change most: red where more of a field raises it, blue where it lowers it.",
