@@ -30,8 +30,10 @@ PRECISION = 1e-9  # of what one of its points sees of the second
 GAUSS, MOST = 24, 3 * 24**2  # points of the longest rule, and points that are seen at most, as in close.c
 OF_CHARGES = 5  # degree of charges on a cell
 REACH = 0.25  # of the size of cells: nearer faces are close
-LEAST = 1e-3  # of the thickness: nearer faces count as so far apart
+DEPTH = 0.005  # of the thickness: between layers below a face, from which its charges are extrapolated
+LEAST = 0.00125  # of the thickness: nearer to a face no layer comes
 INSIDE = 0.5  # of the thickness: mid-surfaces that are nearer are in each other
+EXTRAPOLATED = 3.0, -3.0, 1.0  # from three layers, as in close.c
 ALONG = 0.7  # cosine of the angle of cells that lie above each other, at least
 CHARGES = basix.create_element(
     basix.ElementFamily.P, basix.CellType.triangle, OF_CHARGES, basix.LagrangeVariant.gl_isaac, discontinuous=True
@@ -122,11 +124,12 @@ class Close:
             seen = self._pairs.seen(self._cells, nodes, one, other, MOST)
             if seen is None:
                 continue
-            X, w, shift = seen
+            X, w, *deep = seen
             places, flat = (self._X, X.reshape(-1, 2)), (len(self._X), w.shape[1])
             (t, q), (t_of, q_of) = (self._of(cell, at) for cell, at in zip((one, other), places, strict=True))
-            layers = self._heights + (shift / t)[:, None]
-            left = Points(self._tabulated(self._X), layers, t[None], self._w[None, :, None] * q)
+            layers, of_layers, by_t = self._layered(t, *deep)
+            q = self._w[:, None] * np.einsum("pls,ps->pl", of_layers, q)
+            left = Points(self._tabulated(self._X), layers, t[None], q[None])
             q_of = w.reshape(1, *flat, 1) * q_of.reshape(1, *flat, -1)
             tables = self._tabulated(places[1]).reshape(*flat, 3, -1)
             right = Points(tables, np.broadcast_to(self._heights, q_of.shape[1:]), t_of.reshape(1, *flat), q_of)
@@ -137,14 +140,31 @@ class Close:
                 if cell not in own:
                     continue
                 copy, number = divmod(cell, len(self._shape.r0))
-                on = self._copies.charges[copy] * weight[:, None] * on_q[i].reshape(len(at), -1)
+                on, of_height = on_q[i].reshape(len(at), -1), self._heights if i else by_t
+                on = on if i else np.einsum("pls,pl->ps", of_layers, on)
+                on = self._copies.charges[copy] * weight[:, None] * on
                 on_charges[number] += (monomials(at, OF_CHARGES) @ basis).T @ on
                 if on_heights:
-                    on_t = self._copies.up[copy] * (on_heights[i].reshape(len(at), -1) @ self._heights)
+                    on_t = self._copies.up[copy] * np.sum(on_heights[i].reshape(len(at), -1) * of_height, axis=-1)
                     self._shape.back_of_thickness(np.array([number]), at, on_t[None], into)
         made = self._faces.at(*self._nodes_of_charges, into)
         assert made.back
         made.back(np.zeros_like(made.x), on_charges)
+
+    def _layered(self, t: Array, inward: Array, shift: Array) -> tuple[Array, Array, Array]:
+        """Of layers (n, L) their heights, what multiplies charges (n, L, S), and the heights' part that follows t.
+
+        See `layered` of close.c.
+        """
+        S, n = len(self._heights), np.arange(len(t))
+        near = np.where(inward * t < 0, 0, 1)
+        of_layers = np.broadcast_to(np.eye(S + 2, S), (len(t), S + 2, S)).copy()
+        of_layers[n, near] = 0.0
+        by_t, deep = np.pad(np.tile(self._heights, (len(t), 1)), ((0, 0), (0, 2))), np.zeros((len(t), S + 2))
+        for j, at in enumerate((near, S, S + 1)):
+            of_layers[n, at, near], by_t[n, at] = EXTRAPOLATED[j], self._heights[near]
+            deep[n, at] = (j + 1) * DEPTH * self._shape.h
+        return by_t + (inward / t)[:, None] * (shift[:, None] + deep), of_layers, by_t
 
     def _ordered(self, own: range, close: NDArray[np.bool_]) -> tuple[Ints, NDArray[np.bool_]]:
         """The pairs (n, 2), each once, and which of them are of own cells only."""
@@ -181,7 +201,7 @@ class Close:
         }
         numbers = {"k": arrays["shape"].shape[1], "degree": self._shape.element.degree, "of_charges": OF_CHARGES}
         numbers |= {"S": len(self._heights), "P": len(self._w), "h": self._shape.h}
-        return self._pairs.cells(arrays, **numbers, least=LEAST, inside=INSIDE, precision=PRECISION)
+        return self._pairs.cells(arrays, **numbers, least=LEAST, depth=DEPTH, inside=INSIDE, precision=PRECISION)
 
     @cached_property
     def _heights(self) -> Array:
