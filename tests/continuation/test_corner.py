@@ -53,7 +53,7 @@ def walked(load: float, first: float) -> list[tuple[Label, Point]]:
 
 @pytest.mark.parametrize("first", [0.02, 0.1])
 def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
-    """Folds at f' = 0 and at the touch, with one unstable direction between them; then the stop bears what f does not."""
+    """Folds at f' = 0 and at the touch, between them one unstable direction; then the stop bears what f does not."""
     passed = walked(0.6, first)
     folds = [point for label, point in passed if label == "fold"]
     assert [point.negative_pivots for point in folds] == [0, 1]

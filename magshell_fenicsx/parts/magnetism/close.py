@@ -6,8 +6,12 @@ no pole nearer than pi/2 at any gap, so Gauss's rules converge as fast at all (T
 19.3). The places follow the state; what that misses of a derivative is of the order of the error.
 
 What all cells of a part make together is smooth above it, what one of them makes is not. So of two parts it is always
-the smaller one whose points see the other. Faces that press on each other count as just apart: the pull between them is
-that of a gap of `LEAST`, whatever the penetration of their contact is.
+the smaller one whose points see the other. At free edges of the first cell they are in rows, dense at the edge: there the
+force falls over a gap, and that of the other faces over a thickness.
+
+The face of the first cell that is near the other has its charges in three layers below it, from which they are
+extrapolated: the sum of such charges is that of the face up to its third moment. So nothing is singular where faces
+touch or press on each other, and energy, forces and tangent are one smooth sum down to a penetration of `DEPTH`.
 """
 
 from functools import cached_property

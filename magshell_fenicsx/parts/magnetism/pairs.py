@@ -226,7 +226,7 @@ class Pairs:
         )
 
     def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array, Array] | None:
-        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and `shift` (P,) of close.c.
+        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and `shift` (P,).
 
         None if both are in each other.
         """
