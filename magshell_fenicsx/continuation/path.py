@@ -115,8 +115,8 @@ class Path:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        guess = self.between(s, *([low] if base.across else [low, high]))  # to a corner, not around it
-        near = None if counted else high.state
+        ends, near = (low,) if base.across else (low, high), None if counted else high.state
+        guess = self.between(s, *ends)  # to a corner, not around it
         return self.solve(self._row(s, base), s, guess, stress, near=near, counted=counted)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
@@ -225,12 +225,9 @@ class Path:
         return self._beside(low) if sharp else low
 
     def _beside(self, point: Point) -> Point:
-        """The point with arc length along its displacement alone: where forces set in, the load may turn back sharply.
-
-        A path that turns by more than a right angle has no point ahead along its tangent.
-        """
+        """The point with arc length along its displacement: a path that turns sharply has no point along its tangent."""
         square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
-        return replace(point, across=(point.du / square, 0.0)) if square else point
+        return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0)) if square else point
 
     def value(self, quantity: Quantity, state: State) -> float:
         """The amplitude of the path, or the displacement conjugate to it, at a state."""

@@ -6,8 +6,8 @@ no pole nearer than pi/2 at any gap, so Gauss's rules converge as fast at all (T
 19.3). The places follow the state; what that misses of a derivative is of the order of the error.
 
 What all cells of a part make together is smooth above it, what one of them makes is not. So of two parts it is always
-the smaller one whose points see the other. At free edges of the first cell they are in rows, dense at the edge: there the
-force falls over a gap, and that of the other faces over a thickness.
+the smaller one whose points see the other. At free edges of the first cell they are in rows, dense at the edge: there
+the force falls over a gap, and that of the other faces over a thickness.
 
 The face of the first cell that is near the other has its charges in three layers below it, from which they are
 extrapolated: the sum of such charges is that of the face up to its third moment. So nothing is singular where faces
@@ -211,7 +211,8 @@ class Close:
         of_layers = np.broadcast_to(np.eye(S + 2, S), (len(t), S + 2, S)).copy()
         of_layers[n, near] = 0.0
         by_t, deep = np.pad(np.tile(self._heights, (len(t), 1)), ((0, 0), (0, 2))), np.zeros((len(t), S + 2))
-        for j, at in enumerate((near, S, S + 1)):
+        for j in range(3):
+            at = np.full_like(near, S - 1 + j) if j else near
             of_layers[n, at, near], by_t[n, at] = EXTRAPOLATED[j], self._heights[near]
             deep[n, at] = (j + 1) * DEPTH * self._shape.h
         return by_t + (inward / t)[:, None] * (shift[:, None] + deep), of_layers, by_t
