@@ -225,7 +225,7 @@ class Path:
         return self._beside(low) if sharp else low
 
     def _beside(self, point: Point) -> Point:
-        """The point with arc length along its displacement: a path that turns sharply has no point along its tangent."""
+        """The point with arc length along its displacement: a path that turns sharply has none along its tangent."""
         square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
         return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0)) if square else point
 
