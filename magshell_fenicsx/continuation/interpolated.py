@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 
 REAL = 1e-12  # imaginary part of a root that counts as real
+LEAST = 0.05  # of a way to a corner, from both ends
 
 
 def slope(places: Sequence[float]) -> list[tuple[float, float]]:
@@ -49,3 +50,8 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
         bend = 2 * sum(1 / (a - b) for b in others)
         weights.append((square * (1 - bend * (s - a)), square * (s - a)))
     return weights
+
+
+def corner(rise: float, low: float, high: float) -> float:
+    """The part of the way at which straight lines from both ends meet, not too near them; slopes as of `stationary`."""
+    return min(max((rise - high) / (low - high), LEAST), 1 - LEAST)

@@ -115,7 +115,8 @@ class Path:
         """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        guess, near = self.between(s, low, high), None if counted else high.state
+        ends, near = (low,) if base.across else (low, high), None if counted else high.state
+        guess = self.between(s, *ends)  # to a corner, not around it
         return self.solve(self._row(s, base), s, guess, stress, near=near, counted=counted)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
@@ -201,14 +202,14 @@ class Path:
         u, mu, name = state.u, state.mu, self.name
         bend = self.system.curvature(u, mu, name, name)
         dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - bend * dmu
-        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner((base.du, base.dmu), direction)}[self.control]
+        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner(base.normal, direction)}[self.control]
         softness = dq / dmu if dmu else np.inf
         s = self._arc_length(state, base) if self.control == "arc" else self.value(self.control, state)
         return self._point(state, s, Response(du, dmu, softness, negative_pivots)).per(rate)
 
     def _arc_length(self, state: State, base: Point) -> float:
         chord = (state.u - base.state.u, state.mu[self.name] - base.state.mu[self.name])
-        return base.s + self.metric.inner((base.du, base.dmu), chord)
+        return base.s + self.metric.inner(base.normal, chord)
 
     def measured_from(self, base: Point, point: Point) -> Point:
         """The point with its arc length from a base; unchanged with another control."""
@@ -216,7 +217,17 @@ class Path:
 
     def as_base(self, point: Point) -> Point:
         """The point with a tangent of length one, so that arc length can be measured from it."""
-        return point.per(self.metric.norm(point.du, point.dmu)) if self.control == "arc" else point
+        return point.per(self.metric.norm(point.du, point.dmu)) if self.control == "arc" and not point.across else point
+
+    def before(self, low: Point, high: Point) -> Point:
+        """The first of two points, from which the second is measured: see `_beside`."""
+        sharp = self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0
+        return self._beside(low) if sharp else low
+
+    def _beside(self, point: Point) -> Point:
+        """The point with arc length along its displacement: a path that turns sharply has none along its tangent."""
+        square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
+        return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0)) if square else point
 
     def value(self, quantity: Quantity, state: State) -> float:
         """The amplitude of the path, or the displacement conjugate to it, at a state."""
@@ -278,8 +289,11 @@ class Path:
 
     def _tried(self, here: Point, plan: Plan) -> Point | Far | str:
         """The next point, one that is too far away, or why there is none; see `_reached` before forces set in."""
-        tried = self._try(plan.s, plan.seen)
-        return self._reached(here, tried) if plan.ahead.part < 1 and not plan.ahead.behind else tried
+        tried, ahead = self._try(plan.s, plan.seen), plan.ahead
+        if ahead.part < 1 and not ahead.behind:
+            return self._reached(here, tried)
+        sharp = ahead.part < 1 and self.control == "arc" and not isinstance(tried, Point)
+        return self._try(plan.s, [self._beside(here)]) if sharp else tried
 
     def _look_again(self, course: Course, far: Far, sense: float) -> bool:
         """Whether a point that was found too far away is a step from the last one; if so it is the last one now."""
@@ -344,7 +358,7 @@ class Path:
         """The point with its tangent per unit of s, where s is measured from `base`."""
         if self.control != "arc":
             return point
-        return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
+        return point.per(self.metric.inner(base.normal, (point.du, point.dmu)))
 
     def _try(self, s: float, passed: Sequence[Point]) -> Point | Far | str:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
@@ -366,8 +380,8 @@ class Path:
         length = there.s - here.s
         if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
-        same = there.negative_pivots == here.negative_pivots
-        corner = self.newton.options.kinks and same  # no corner is an instability
+        same = there.negative_pivots == here.negative_pivots or here.across is not None
+        corner = self.newton.options.kinks and same  # no corner is an instability, but where the load turns back
         return None if (self._explained if corner else self._smooth)(here, there) else TURNS
 
     def _smooth(self, here: Point, there: Point) -> bool:
@@ -413,7 +427,7 @@ class Path:
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "arc":
-            return Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
+            return Hyperplane(self.metric, self.name, base.state, base.normal, s - base.s)
         return self.given(self.control, s)
 
     def _point(self, state: State, s: float, response: Response) -> Point:

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import Direction, State, Vector
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class Point:
         The estimated error of the amplitude of an instability.
     habit
         That of the factorisation after it, by which a resumed run goes on with the same rounding.
+    across
+        The direction along which arc length is measured from it, if that is not its tangent.
     """
 
     state: State
@@ -43,6 +45,12 @@ class Point:
     error: float = 0.0
     load_error: float = 0.0
     habit: int = -1
+    across: Direction | None = field(default=None, repr=False)
+
+    @property
+    def normal(self) -> Direction:
+        """The direction along which arc length is measured from it."""
+        return self.across or (self.du, self.dmu)
 
     def per(self, rate: float) -> "Point":
         """The point with its tangent divided by `rate`."""

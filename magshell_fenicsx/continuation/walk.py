@@ -9,7 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.control import projected
-from magshell_fenicsx.continuation.interpolated import stationary
+from magshell_fenicsx.continuation.interpolated import corner, stationary
 from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
@@ -110,6 +110,8 @@ class _Search:
 
     def left(self, point: Point, low: Point, high: Point) -> bool:
         """Whether a point is so far from the cubic between two points that it lies on another branch."""
+        if self.base.across:  # no cubic goes around a corner
+            return False
         system, guess = self.path.system, self.path.between(point.s, low, high)
         off = max_abs(system.comm, point.state.u - guess.u)
         chord = max_abs(system.comm, high.state.u - low.state.u)
@@ -193,7 +195,7 @@ class _Search:
         """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
         name = self.path.name
         for _ in range(MOST_TRIALS):
-            s = _stationary(low, high, name)
+            s = _stationary(low, high, name, corner if self.base.across else stationary)
             point = self.solve(s, low, high)
             mu = point.state.mu[name]
             other = high if point.dmu * low.dmu > 0 else low
@@ -267,10 +269,10 @@ def _slope_of(low: tuple[float, float], high: tuple[float, float]) -> float:
     return (last - first) / (b - a) if first * last < 0 and a != b else 0.0
 
 
-def _stationary(low: Point, high: Point, name: str) -> float:
-    """Where the Hermite cubic of mu(s) is stationary between the ends."""
+def _stationary(low: Point, high: Point, name: str, find: Callable[[float, float, float], float]) -> float:
+    """Where the Hermite cubic of mu(s) is stationary between the ends, or where else one finds it."""
     L = high.s - low.s
-    return low.s + L * stationary((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
+    return low.s + L * find((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
 
 
 def locate_bifurcation(
@@ -358,7 +360,7 @@ class Walk:
         options, shorter, why = self.path.options, None, ""
         while True:
             for point, reached in self.path.towards(self.points[-1], self._ahead(), self._arrive):
-                low, shorter = self.points[-1], None
+                low, shorter = self.path.before(self.points[-1], point), None
                 try:
                     state = self._renew(low, point) if self._renew else None
                 except StepTooLong as e:

@@ -39,7 +39,7 @@ class Step:
     """
 
     def __init__(self, path: Path, low: Point, high: Point) -> None:
-        self._path, self._low = path, path.as_base(low)
+        self._path, self._low = path, path.before(path.as_base(low), high)
         self._points = [self._low, path.measured_from(self._low, high)]
 
     def place(self, point: Point) -> float:

@@ -86,8 +86,8 @@ static void fan(const double *one, const double *two, const double *foot, double
 
 /* What all pairs have: k nodes of a cell, its shape functions from monomials up to `degree`, charges and thickness of each
    cell from those up to `of_charges` (cells, .., S) and (cells, ..), heights over the thickness (S,); P points of the first
-   cell with T (P, 3, k), X (P, 2) and weights; Gauss's rules one after the other; h, and in parts of it how far faces count
-   as apart at least, and how near mid-surfaces are in each other. */
+   cell with T (P, 3, k), X (P, 2) and weights; Gauss's rules one after the other; h, and in parts of it how deep the first
+   layer of a face is, how near to a face that comes at least, and how near mid-surfaces are in each other. */
 typedef struct {
     int64_t k, degree;
     const double *shape;
@@ -95,7 +95,7 @@ typedef struct {
     const double *charges, *thickness, *heights;
     int64_t P;
     const double *T, *X, *weights, *gauss;
-    double h, least, inside, precision;
+    double h, depth, least, inside, precision;
 } Cells;
 
 /* The number of monomials of charges and of the thickness. */
@@ -151,11 +151,11 @@ INLINE void foot_of(const Cells *all, const double *of, const double *x, double 
     }
 }
 
-/* What a point of the first cell (k, 3), with T there, sees of the second, by its monomials, and how far its charges are
-   shifted along its normal so that faces that press on each other are just apart. The return value is 1 if both are in
-   each other. */
+/* What a point of the first cell (k, 3), with T there, sees of the second, by its monomials. `inward` gets 1 where the normal
+   leads away from the second, else -1, and `shift` how far the charges are moved that way, so that their first layer is just
+   outside of the second. The return value is 1 if both are in each other. */
 static int seen(const Cells *all, const v *T, const double *first, const double *second, double t,
-                int64_t other, Fan *to, double *shift)
+                int64_t other, Fan *to, double *inward, double *shift)
 {
     const int count = number_of(all);
     double a[3][3], n[3], b[3][3], m[3], x[3], foot[2] = {1.0 / 3.0, 1.0 / 3.0};
@@ -163,9 +163,9 @@ static int seen(const Cells *all, const v *T, const double *first, const double 
     foot_of(all, second, a[0], foot, b, m);
     for (int i = 0; i < 3; ++i)
         x[i] = a[0][i] - b[0][i];
-    const double up = dot(x, m) < 0.0 ? -1.0 : 1.0, towards = dot(x, n) < 0.0 ? 1.0 : -1.0;
+    const double up = dot(x, m) < 0.0 ? -1.0 : 1.0, away = dot(x, n) < 0.0 ? -1.0 : 1.0;
     for (int i = 0; i < 3; ++i)
-        x[i] = a[0][i] + towards * fabs(t) / 2.0 * n[i];
+        x[i] = a[0][i] - away * fabs(t) / 2.0 * n[i];
     foot_of(all, second, x, foot, b, m);
     for (int i = 0; i < 3; ++i)
         x[i] -= b[0][i];
@@ -173,12 +173,27 @@ static int seen(const Cells *all, const v *T, const double *first, const double 
     monomials((int)all->of_charges, foot[0] + (v){0.0}, foot[1] + (v){0.0}, f, 0, 0);
     polynomial(count, 1, all->thickness + other * count, f, &thick);
     const double gap = up * dot(x, m) - fabs(thick[0]) / 2.0, least = all->least * all->h;
-    const int over = foot[0] > 0.0 && foot[1] > 0.0 && foot[0] + foot[1] < 1.0, inside = gap < -all->inside * all->h;
-    if (over && inside)
+    const double layer = gap + all->depth * all->h;
+    const int over = foot[0] > 0.0 && foot[1] > 0.0 && foot[0] + foot[1] < 1.0;
+    if (over && gap < -all->inside * all->h)
         return 1;
-    *shift = inside || gap >= least ? 0.0 : -towards * (least - gap);
-    fan(b[1], b[2], foot, gap > least ? gap : least, all->gauss, all->precision, to);
+    *inward = away, *shift = over && layer < least ? least - layer : 0.0;
+    fan(b[1], b[2], foot, fmax(fabs(layer + *shift), least), all->gauss, all->precision, to);
     return 0;
+}
+
+/* Charges (S + 2,) of a point of the first cell, and their heights over its thickness t, from those of its layers (S,): the
+   face that is near the other cell is in three layers below it, from where it is extrapolated. */
+INLINE void layered(const Cells *all, v *q, double t, double inward, double shift, double *heights)
+{
+    const int S = (int)all->S, near = inward * t < 0.0 ? 0 : 1;
+    for (int s = 0; s < S; ++s)
+        heights[s] = all->heights[s] + inward * shift / t;
+    for (int j = 0; j < 3; ++j) {
+        const int s = j ? S - 1 + j : near;
+        heights[s] = all->heights[near] + inward * (shift + (j + 1) * all->depth * all->h) / t;
+        q[s] = (j == 1 ? -1.0 : j ? 1.0 / 3.0 : 3.0) * q[near];
+    }
 }
 
 INLINE double total(const v *x)
@@ -239,10 +254,10 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
                   double factor, double *onto, double *blocks, const int32_t *where, int64_t columns,
                   const int64_t *row_of, const int64_t *column_of, const double *turn, int64_t modelled)
 {
-    const int k = (int)all->k, half = 9 * k * (k + 1) / 2, bent = onto != 0, S = (int)all->S;
+    const int k = (int)all->k, half = 9 * k * (k + 1) / 2, bent = onto != 0, S = (int)all->S, L = S + 2;
     const int number = number_of(all);
-    double energy = 0.0, H[bent ? 9 * k * k : 1], heights[S];
-    v XL[3 * k], XR[3 * k], GL[3 * k], GR[3 * k], TL[3 * k], TR[3 * k], A[9 * k], B[9 * k], q[S], of_right[S], f[number];
+    double energy = 0.0, H[bent ? 9 * k * k : 1], heights[L];
+    v XL[3 * k], XR[3 * k], GL[3 * k], GR[3 * k], TL[3 * k], TR[3 * k], A[9 * k], B[9 * k], q[L], of_right[S], f[number];
     v HL[bent ? half : 1], HR[bent ? half : 1], HX[bent ? 9 * k * k : 1], X[24], sum, thick;
     Fan points;
     for (int64_t pair = 0; pair < count; ++pair) {
@@ -260,11 +275,12 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
             monomials((int)all->of_charges, all->X[2 * p] + (v){0.0}, all->X[2 * p + 1] + (v){0.0}, f, 0, 0);
             polynomial(number, S, all->charges + one * number * S, f, q);
             polynomial(number, 1, all->thickness + one * number, f, &left.t);
-            double shift;
-            if (seen(all, TL, first, second, left.t[0], other, &points, &shift))
+            double inward, shift;
+            if (seen(all, TL, first, second, left.t[0], other, &points, &inward, &shift))
                 return NAN;
             for (int s = 0; s < S; ++s)
-                q[s] *= all->weights[p], heights[s] = all->heights[s] + shift / left.t[0];
+                q[s] *= all->weights[p];
+            layered(all, q, left.t[0], inward, shift, heights);
             memset(A, 0, sizeof A), memset(B, 0, sizeof B);
             for (int64_t at = 0; at < points.count; at += LANES) {
                 v x, y, w;
@@ -279,11 +295,11 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
                 for (int s = 0; s < S; ++s)
                     of_right[s] *= w;
                 if (S == 2 && !bent)
-                    between(2, 2, 0, &left, q, heights, &right, of_right, all->heights, &sum, X);
+                    between(4, 2, 0, &left, q, heights, &right, of_right, all->heights, &sum, X);
                 else if (S == 2)
-                    between(2, 2, 1, &left, q, heights, &right, of_right, all->heights, &sum, X);
+                    between(4, 2, 1, &left, q, heights, &right, of_right, all->heights, &sum, X);
                 else
-                    between(S, S, bent, &left, q, heights, &right, of_right, all->heights, &sum, X);
+                    between(L, S, bent, &left, q, heights, &right, of_right, all->heights, &sum, X);
                 own(k, TR, &right, GR, bent ? HR : 0);
                 if (bent)
                     mixed(k, TR, &right, X, A, B);
@@ -315,9 +331,9 @@ FAST double close_pairs(const Cells *all, int64_t count, const int64_t *both, co
 }
 
 /* What the points of the first cell of a pair see of the second: how many points each (P,), their places (P, most, 2) and
-   weights (P, most), and the shifts (P,); the rest is left as it is. The return value is 1 if both are in each other. */
+   weights (P, most), and `inward` and `shift` (P,); the rest is left as it is. The return value is 1 if both are in each other. */
 int64_t seen_of(const Cells *all, int64_t one, int64_t other, const double *nodes, int64_t most, int64_t *count,
-                double *x, double *w, double *shift)
+                double *x, double *w, double *inward, double *shift)
 {
     const int k = (int)all->k, number = number_of(all);
     Fan points;
@@ -328,7 +344,7 @@ int64_t seen_of(const Cells *all, int64_t one, int64_t other, const double *node
         spread(3 * k, all->T + 3 * k * p, T);
         monomials((int)all->of_charges, all->X[2 * p] + (v){0.0}, all->X[2 * p + 1] + (v){0.0}, f, 0, 0);
         polynomial(number, 1, all->thickness + one * number, f, &t);
-        if (seen(all, T, nodes + 3 * k * one, second, t[0], other, &points, shift + p))
+        if (seen(all, T, nodes + 3 * k * one, second, t[0], other, &points, inward + p, shift + p))
             return 1;
         count[p] = points.count;
         for (int64_t m = 0; m < points.count; ++m) {

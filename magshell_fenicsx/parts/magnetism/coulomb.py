@@ -173,7 +173,7 @@ class Charged:
         number = np.tile(np.arange(len(shape.r0)), len(copies.images))
         order = np.empty(len(parts), dtype=np.intp)
         order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(ROUNDED)])] = np.arange(len(parts))
-        self._close = Close(shape, kinds[0].family, copies, order, comm)
+        self._close = Close(shape, kinds[0].family, copies, parts, order, comm)
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))

@@ -31,10 +31,12 @@ FUNCTIONS = """
     void turn_blocks(int64_t, const int32_t *, const int32_t *, const double *, const double *, double, const double *,
         const int64_t *, const double *, float *);
     typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S; const double *charges, *thickness,
-        *heights; int64_t P; const double *T, *X, *weights, *gauss; double h, least, inside, precision; } Cells;
+        *heights; int64_t P; const double *T, *X, *weights, *gauss; double h, depth, least, inside,
+        precision; } Cells;
     double close_pairs(const Cells *, int64_t, const int64_t *, const double *, double *, double, double *, double *,
         const int32_t *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
-    int64_t seen_of(const Cells *, int64_t, int64_t, const double *, int64_t, int64_t *, double *, double *, double *);
+    int64_t seen_of(const Cells *, int64_t, int64_t, const double *, int64_t, int64_t *, double *, double *, double *,
+        double *);
 """
 INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
 KEPT: WeakKeyDictionary[Any, dict[str, Array]] = WeakKeyDictionary()
@@ -223,17 +225,17 @@ class Pairs:
             else 0.0
         )
 
-    def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array] | None:
-        """What P points of a cell see of another: places (P, M, 2), weights (P, M), and how far each is shifted (P,).
+    def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array, Array] | None:
+        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and `shift` (P,).
 
         None if both are in each other.
         """
-        p, count, shift = self._pointer, np.zeros(of.P, dtype=np.int64), np.zeros(of.P)
+        p, count, (inward, shift) = self._pointer, np.zeros(of.P, dtype=np.int64), np.zeros((2, of.P))
         X, w = np.full((of.P, most, 2), 1 / 3), np.zeros((of.P, most))
-        if self._lib.seen_of(of, one, other, p(nodes), most, p(count), p(X), p(w), p(shift)):
+        if self._lib.seen_of(of, one, other, p(nodes), most, p(count), p(X), p(w), p(inward), p(shift)):
             return None
         longest = count.max()
-        return X[:, :longest], w[:, :longest], shift
+        return X[:, :longest], w[:, :longest], inward, shift
 
     def finish(
         self, nodes: Array, cells: Ints, points: "Points", gradient: Array, stiffness: Stiffness | None = None

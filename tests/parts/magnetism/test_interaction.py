@@ -543,3 +543,33 @@ def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
     for weights, of in ((Weights(1.0, 0.0), energy), (Weights(0.0, 1.0), np.sum(slope * rates))):
         by = charged.by_fields(nodes, rates, own, weights).by_remanence
         assert np.sum(by * charged._shape.remanence) == pytest.approx(2 * of, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [1e-4, -1e-3])
+def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, gap: float) -> None:
+    """A strip leans on another one just behind its end: forces and tangent are slopes of the energy, by differences.
+
+    Shorter by 0.1 h, it would be in the other one if it went on. The gap (h) is that of its end.
+    """
+    h = 0.3
+    rooted_strips(tmp_path / "strips.msh")
+    held = {"part0": "clamped", "root": "clamped"}
+    scene = Scene(case_of(tmp_path / "strips.msh", h, boundary=held, mesh={"degree": 2}))
+    system, mu = scene.model.system, {"interaction": 1.0}
+    (term,) = (each for each in system.terms if each.name == "interaction")
+    x, _, z = 5 * scene.model.r0.x.array.reshape(-1, 3).T
+    upper, (sine, cosine) = z > 1e-6, (0.1, np.sqrt(0.99))
+    end = 0.5 * h * (1 + cosine) + gap * h  # of the mid-surface, whose lower face touches with its edge
+    places = [4.0 - 0.1 * h - 0.5 * h * sine + cosine * (x - 4.0), end - sine * (x - 4.0) - 1.5]
+    u = np.zeros((len(x), 3))
+    u[upper, 0], u[upper, 2] = ((each - (x if i == 0 else 0))[upper] / 5 for i, each in enumerate(places))
+    v = np.where(upper, -((x / 4) ** 2), 0.0)[:, None] * [0, 0, 1]
+    u, v, step = u.ravel(), v.ravel(), 1e-4 * h / 5
+    sides = [u + side * step * v for side in (1, -1)]
+    energies = [system.at(State(each, mu)).of(term.energy) for each in sides]
+    assert (energies[0] - energies[1]) / (2 * step) == pytest.approx(gradient(scene, u) @ v, rel=1e-5)
+    acting = system.at(State(u, mu)).of(term.acting)
+    bend = v @ (acting.stored @ v + acting.times_others(v[:, None]).ravel())
+    slopes = [gradient(scene, each) @ v for each in sides]
+    assert (slopes[0] - slopes[1]) / (2 * step) == pytest.approx(bend, rel=2e-3)

@@ -1,0 +1,68 @@
+"""A body on a spring that snaps against a stop: by arc length, its load falls to the touch and rises at once behind it.
+
+A softening spring, f = x^3 - 3 x^2 + 2 x, carries a body with x <= X but for the penalty; the load pulls at its other
+end by a linear spring, q = x + load/K. All of it is known in closed form.
+"""
+
+import numpy as np
+import pytest
+from continuation.toys import Toy
+
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point, StepOptions
+from magshell_fenicsx.continuation.snes import NewtonOptions
+from magshell_fenicsx.continuation.stepping import Ahead
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.walk import Goal, Label, Walk
+from magshell_fenicsx.parts.gap import penalty
+
+K, X, STIFF, SOFT, DEEP = 2.0, 0.8, 1e5, 1e-5, 1e-4
+
+
+def f(x: float) -> float:
+    return x**3 - 3 * x**2 + 2 * x
+
+
+def stop() -> Toy:
+    def gradient(u: Vector) -> Vector:
+        q, x = u
+        pressed = penalty(np.array([x - X]), STIFF, SOFT)[1][0]
+        return np.array([K * (q - x), f(x) - K * (q - x) + pressed])
+
+    def hessian(u: Vector) -> Vector:
+        stiff = penalty(np.array([u[1] - X]), STIFF, SOFT)[2][0]
+        return np.array([[K, -K], [-K, 3 * u[1] ** 2 - 6 * u[1] + 2 + K + stiff]])
+
+    return Toy(gradient, hessian, 2)
+
+
+def way_to_touch(here: State, guess: State) -> Ahead:
+    """As shells have it in `simulate.onset`."""
+    gap, way = X - here.u[1], guess.u[1] - here.u[1]
+    behind = gap < 4 * DEEP
+    part = (gap + (DEEP if behind else -DEEP)) / way if way and gap > 0 else 1.0
+    return Ahead(part, behind) if 0 < part < 1 else Ahead()
+
+
+def walked(load: float, first: float) -> list[tuple[Label, Point]]:
+    newton = BorderedNewton(stop(), NewtonOptions(fresh=0.0, patience=7, kinks=True))
+    path = Path(newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch)
+    return list(Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("target", [load])))
+
+
+@pytest.mark.parametrize("first", [0.02, 0.1])
+def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
+    """Folds at f' = 0 and at the touch, between them one unstable direction; then the stop bears what f does not."""
+    passed = walked(0.6, first)
+    folds = [point for label, point in passed if label == "fold"]
+    assert [point.negative_pivots for point in folds] == [0, 1]
+    assert folds[0].state.mu["load"] == pytest.approx(f(1 - 1 / np.sqrt(3)), rel=1e-8)
+    assert folds[1].state.mu["load"] == pytest.approx(f(X), rel=1e-4)  # the penalty sets in over SOFT
+    assert len(passed) < 60, "it does not creep"
+    q, x = passed[-1][1].state.u
+    assert passed[-1][0] == "target"
+    assert passed[-1][1].negative_pivots == 0
+    assert q == pytest.approx(X + 0.6 / K, abs=1e-4)
+    pressed = penalty(np.array([x - X]), STIFF, SOFT)[1][0]
+    assert pressed == pytest.approx(0.6 - f(X), rel=1e-4), "the stop bears what the spring does not"
