@@ -15,7 +15,7 @@ from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
 FINE = 0.5  # of sqrt(R h): cells where shells meet
-AROUND = 2.0  # of sqrt(R h): how far from there
+AROUND, APART = 1.0, 2.0  # of sqrt(R h): how far from there, and how far from each other places are one
 ALIKE = 0.5  # of the thickness: places that are so much farther from each other may meet as well
 
 

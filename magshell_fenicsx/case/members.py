@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.meeting import AROUND, meetings
+from magshell_fenicsx.case.meeting import APART, meetings
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member
 from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, SECOND_CUT, Mirror, Sector, rotation
@@ -155,7 +155,7 @@ class Members:
         for part, ground in zip(several.parts, self._grounds, strict=True):
             h, place = 1 / part.case.shell.R_over_h, several.place(part)
             places[part.name] = place(ground.perfect.sample())
-            thickness[part.name], apart[part.name] = h * place.scale, AROUND * sqrt(h) * place.scale
+            thickness[part.name], apart[part.name] = h * place.scale, APART * sqrt(h) * place.scale
         found = meetings(several.pairs, places, thickness, apart)
         return {part.name: [several.place(part).own(x) for x in found[part.name]] for part in several.parts}
 
