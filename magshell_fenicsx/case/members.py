@@ -1,13 +1,15 @@
 """The meshes of several shells, whole or halved by a plane in which each of them is its own mirror image."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.meeting import APART, meetings
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member
 from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, SECOND_CUT, Mirror, Sector, rotation
@@ -82,7 +84,7 @@ class Members:
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
         try:
-            problem = make_problem(part.case, plane=plane)
+            problem = make_problem(part.case, plane=plane, met=self._met[part.name])
             if problem.awaited:
                 raise CaseError("shell.imperfections: kind: modes: is of a shell alone: take another kind")
             patch = problem.triangulated()
@@ -143,6 +145,19 @@ class Members:
     @cached_property
     def _grounds(self) -> Sequence[Ground]:
         return [ground_of(part.case.shell) for part in self._several.parts]
+
+    @cached_property
+    def _met(self) -> Mapping[str, Sequence[Array]]:
+        """Name of a shell -> places (3,) in its own frame where others that it may touch are nearest."""
+        several, places, thickness, apart = self._several, dict[str, Array](), dict[str, float](), dict[str, float]()
+        if not several.pairs:
+            return {part.name: [] for part in several.parts}
+        for part, ground in zip(several.parts, self._grounds, strict=True):
+            h, place = 1 / part.case.shell.R_over_h, several.place(part)
+            places[part.name] = place(ground.perfect.sample())
+            thickness[part.name], apart[part.name] = h * place.scale, APART * sqrt(h) * place.scale
+        found = meetings(several.pairs, places, thickness, apart)
+        return {part.name: [several.place(part).own(x) for x in found[part.name]] for part in several.parts}
 
     @property
     def _held(self) -> bool:

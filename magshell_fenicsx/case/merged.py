@@ -55,7 +55,7 @@ def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -
     parts = [
         Part(name, section, _case(name, section, data, {**around}, case)) for name, section in sections.items()
     ]  # in the order of the file
-    several = Several(parts, _joined(_renamed(data.get("joints"), sections)))
+    several = Several(parts, _joined(_renamed(data.get("joints"), sections)), _pairs(data.get("contact")))
     first = _merged(parts)
     whole = {key: _renamed(value, sections) if key in OF_NAMES else value for key, value in data.items()}
     whole |= {
@@ -237,6 +237,12 @@ def _magnetised(magnetic: Any, several: Several) -> Any:
     whole = {part.name for part in several.parts}  # before those of their parts, which take their place
     ordered = dict(sorted(patches.items(), key=lambda item: item[0] not in whole))
     return {**given, "remanent": {"kind": "patches", "patches": ordered, **density}}
+
+
+def _pairs(given: Any) -> list[list[str]]:
+    """The pairs of names among what `contact` has; what else it has is refused later."""
+    pairs = [pair for pair in given if isinstance(pair, list | tuple)] if isinstance(given, list | tuple) else []
+    return [[*pair] for pair in pairs if len(pair) == 2 and all(isinstance(name, str) for name in pair)]
 
 
 def _renamed(part: Any, shells: Mapping[str, Any]) -> Any:

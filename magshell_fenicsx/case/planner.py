@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.meeting import Meeting
 from magshell_fenicsx.case.opened import changed, perfect_case
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
@@ -58,11 +59,16 @@ FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as t
 
 
 def make_problem(
-    case: Case, terms: Sequence[OwnTerm] = (), plane: Mirror | None = None, smooth: Collection[str] = ()
+    case: Case,
+    terms: Sequence[OwnTerm] = (),
+    plane: Mirror | None = None,
+    smooth: Collection[str] = (),
+    met: Sequence[Array] = (),
 ) -> Problem:
     """The problem of a case, with its user-defined energies and `terms`; its half at a plane that is `kept`, if given.
 
-    Formulas of the keys in `smooth` are known to have no details that samples do not show.
+    Formulas of the keys in `smooth` are known to have no details that samples do not show. Other shells touch it at the
+    places `met` (3,), over R.
 
     Raises
     ------
@@ -126,7 +132,9 @@ def make_problem(
         varying, everywhere = of_imperfections(wide, perfect, turn, material.h)
         varying += refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
-    size = grading(context, drawn, material.h, [*local, *touched], everywhere, loaded, varying, local=bool(local))
+    facing = [Meeting(_chart(rotation(turn) @ x, drawn, half=half)) for x in met]
+    shown = [*local, *touched, *facing]
+    size = grading(context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local))
     drawn = imperfect(perfect, imperfections, turn, still)
     shape = drawn.chart(beyond, size)
     if isinstance(beyond, Sector) and not isinstance(shape, Grid):  # a ring has no tip
@@ -375,8 +383,7 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
 
     def chart(name: str, x: Array) -> Array:
         refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
-        places = drawn.inverse(Q @ x)
-        return drawn.on_half(places) if half else places
+        return _chart(Q @ x, drawn, half=half)
 
     points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
     if points:
@@ -384,6 +391,12 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     elif drawn.highest is not None:
         points["pole"] = drawn.highest
     return points
+
+
+def _chart(x: Array, drawn: Outline, *, half: bool) -> Array:
+    """That of a place (3,), of its image where the other half is modelled."""
+    places = drawn.inverse(x)
+    return drawn.on_half(places) if half else places
 
 
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:

@@ -101,8 +101,10 @@ class Part:
 class Several:
     """The shells of a case; an `Assembly` is made of them where a mesh is needed."""
 
-    def __init__(self, parts: Sequence[Part], joints: Sequence[tuple[str, str]] = ()) -> None:
-        self.parts, self.joints = parts, joints
+    def __init__(
+        self, parts: Sequence[Part], joints: Sequence[tuple[str, str]] = (), pairs: Sequence[Sequence[str]] = ()
+    ) -> None:
+        self.parts, self.joints, self.pairs = parts, joints, pairs
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Several":
         return self
@@ -114,7 +116,7 @@ class Several:
             [part.name, part.case.model_dump_json(), part.section.place.model_dump_json(), part.case.outside]
             for part in self.parts
         ]
-        return hashlib.sha256(json.dumps([told, self.joints], sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()).hexdigest()
 
     def place(self, part: Part) -> Place:
         """Where a shell is, over the R of the first one."""

@@ -7,7 +7,7 @@ One factorisation of K and two back-solves make a step, whatever the last row.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ from magshell_fenicsx.continuation.snes import (
     make_snes,
 )
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
+
+SOFT = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # of the stiffness of faces that touch: the first is that of a shell
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class BorderedNewton:
         stress
             As that of `System.tangent`, of the guess.
         search
-            Whether a line search is tried where full steps fail and forces set in within a step.
+            Whether softer faces and a line search are tried where full steps fail and forces set in within a step.
         near
             Distance from the guess, in lengths, up to which the factors of another state begin the solve.
         most
@@ -123,9 +125,25 @@ class BorderedNewton:
         if not outcome.converged and self._linear.foreseeing and not (far and not self._linear.misled()):
             outcome = self._solved(self._snes, guess, name, row, stress, near, most)
         if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
-            again = self._solved(self._searching, guess, name, row, stress)
+            again = self._hardened(guess, name, row) or self._solved(self._searching, guess, name, row, stress)
             return again if again.converged else outcome
         return outcome
+
+    def _hardened(self, guess: State, name: str, row: Row) -> Outcome | None:
+        """The solution that is found between faces that are soft at first, and harder time by time; None if none is.
+
+        Faces that lie deep in each other at a guess push shells far away, from where full steps do not come back. Soft
+        ones, as stiff as the shells, show where these touch.
+        """
+        state, iterations = guess, 0
+        for part in SOFT:
+            softer = {key: part * guess.mu.get(key, k) for key, k in self.options.stiffnesses.items()}
+            outcome = self._solved(self._snes, State(state.u, {**state.mu, **softer}), name, row)
+            state, iterations = outcome.state, iterations + outcome.iterations
+            if not outcome.converged:
+                return None
+        outcome = self._solved(self._snes, guess.with_(state.u, name, state.mu[name]), name, row)
+        return replace(outcome, iterations=iterations + outcome.iterations) if outcome.converged else None
 
     def _solved(
         self,
@@ -133,7 +151,7 @@ class BorderedNewton:
         guess: State,
         name: str,
         row: Row,
-        stress: Sequence[Weighted],
+        stress: Sequence[Weighted] = (),
         near: float = 0.0,
         most: float = np.inf,
         *,

@@ -6,8 +6,8 @@ Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4, QNERR). The re
 the stiff part of a structure hides errors of its soft part.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -74,8 +74,9 @@ class NewtonOptions:
         An iteration that moves u by more than this many lengths counts as divergence.
     patience
         Matrices after which the steps of a solve must have shrunk.
-    kinks
-        Whether forces set in within a step, as where shells touch: full steps then circle, and a path has corners.
+    stiffnesses
+        Amplitudes that are the stiffness of faces between which forces set in within a step, as where shells touch,
+        with their values in a state that has none.
     """
 
     tolerance: float = 1e-9
@@ -86,7 +87,12 @@ class NewtonOptions:
     fresh: float = 0.05
     largest_step: float = 1e4
     patience: int = 4
-    kinks: bool = False
+    stiffnesses: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def kinks(self) -> bool:
+        """Whether forces set in within a step: full steps then circle, and a path has corners."""
+        return bool(self.stiffnesses)
 
 
 class LatestTangent:

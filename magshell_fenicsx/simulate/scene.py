@@ -162,8 +162,9 @@ class Scene:
             raise MeshError(motion)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
-        touches = bool(self.model.touchings)
-        options = NewtonOptions(fresh=0.0, patience=7, kinks=touches) if self.model.contacts or touches else None
+        faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
+        stiff = self.model.contacts or faces
+        options = NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces) if stiff else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()

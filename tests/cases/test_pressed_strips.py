@@ -82,3 +82,25 @@ def test_two_cantilevers() -> None:
     }
     assert tips == pytest.approx({name: expected[name] for name in tips}, abs=2e-4 * DOWN)
     assert forces == pytest.approx({name: expected[name] for name in forces}, rel=2e-4)
+
+
+def test_strips_that_meet_flat() -> None:
+    """All of two opposite cantilevers meets at once; behind that they touch along the middle line, F = 12 EI d/L^3 for
+    a way d of one clamp: each half has F (L/2)^3/(3 EI) = d/2."""
+    gap, way, width = 0.1, 0.4, 0.2
+    strip = {"geometry": "plate", "length": 1, "width": width, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
+    upper = {"boundary": {"right": "clamped"}, "place": {"position": [0, 0, (1 + gap) * h]}}
+    case = {
+        "shells": {"lower": {"shell": strip, "boundary": {"left": "clamped"}}, "upper": {"shell": strip, **upper}},
+        "contact": [["upper", "lower"]],
+        "mesh": {"degree": 3, "size": 0.2},
+        "loading": {
+            "kind": "edge", "control": "load", "points": 2, "factor": 1,
+            "moves": [{"supports": ["upper.right"], "translation": [0, 0, -way * h]}],
+        },
+    }  # fmt: skip
+    scene = Scene(Case.from_source(case))
+    points = [(record.label, scene.observe(record.point.state)["contact_force"]) for record in follow(scene)]
+    forces = [2 * np.pi * force for label, force in points if label == "target"]  # over D
+    assert forces == pytest.approx([12 * width * (part * way - gap) * h for part in (0.5, 1)], rel=2e-3)
+    assert len(points) <= 6

@@ -1,0 +1,49 @@
+"""Shells that may touch have small elements where they are nearest to each other."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.case.meeting import FINE, meetings
+
+Array = NDArray[np.float64]
+h = 0.02
+RIM = {"boundary": {"rim": "clamped"}}
+PRESSED = {"kind": "pressure", "pressure": 0.1, "until": "target", "points": 1}
+
+
+def cells_near_poles(**others: Any) -> Array:
+    """Mean length of the sides of the cells around the poles of two caps, over sqrt(R h) of the lower and the upper."""
+    cap = {"geometry": "cap", "polar": 20, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    over = {"position": [0, 0, 2.4 + 1.2 * h], "axis": {"polar": 180}}
+    shells = {
+        "lower": {"shell": cap | {"radius": 1}, **RIM},
+        "upper": {"shell": cap | {"radius": 1.4}, **RIM, "place": over},
+    }
+    case = Case.from_source({"shells": shells, "symmetry": "half", "loading": PRESSED, **others})
+    mesh = case.problem().triangulated()
+    corners = mesh.nodes[mesh.cells[:, :3]][:, :, :3]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+    middle, lower = corners.mean(axis=1), corners[:, :, 2].max(axis=1) <= 1
+    near = np.hypot(*middle[:, :2].T) < np.sqrt(h)
+    return np.array([sides[near & lower].mean() / np.sqrt(h), sides[near & ~lower].mean() / np.sqrt(1.4 * h)])
+
+
+def test_cells_are_small_where_caps_meet() -> None:
+    """0.5 sqrt(R h) at both poles; those of caps that do not touch are larger."""
+    met, alone = cells_near_poles(contact=[["upper", "lower"]]), cells_near_poles()
+    assert met == pytest.approx(FINE, rel=0.2)
+    assert alone.min() > 1.5 * FINE
+
+
+def test_faces_that_are_parallel_have_no_place_where_they_meet() -> None:
+    """A line of places across a flat one is nearest at its one end, if it is inclined; all are if not."""
+    x = np.linspace(0, 1, 41)
+    flat, inclined = np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x, 0.1 + x])
+    thickness, apart = {"a": 0.1, "b": 0.1}, {"a": 0.2, "b": 0.2}
+    found = meetings([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart)
+    assert [each.tolist() for each in found["b"]] == [[0, 0, 0.1]]
+    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart) == {"a": [], "b": []}
