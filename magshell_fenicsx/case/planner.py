@@ -46,7 +46,7 @@ from magshell_fenicsx.problem.formulas import (
 from magshell_fenicsx.problem.limits import unknowns_of
 from magshell_fenicsx.problem.names import refuse_unfit_ends, surface_terms
 from magshell_fenicsx.problem.problem import Awaited, Document, Problem, body_of
-from magshell_fenicsx.problem.sizes import Loaded, grading
+from magshell_fenicsx.problem.sizes import Loaded, Shown, grading
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
@@ -133,7 +133,7 @@ def make_problem(
         varying += refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
     facing = [Meeting(_chart(rotation(turn) @ x, drawn, half=half)) for x in met]
-    shown = [*local, *touched, *facing]
+    shown: list[Shown] = [*local, *touched, *facing]
     size = grading(context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local))
     drawn = imperfect(perfect, imperfections, turn, still)
     shape = drawn.chart(beyond, size)
