@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
+from magshell_fenicsx.assembly.whole import Singles
 from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
 from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
-from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import Kept, Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
 
 Array = NDArray[np.float64]
@@ -173,9 +174,14 @@ class Far:
             self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
         return L
 
-    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array) -> NDArray[np.float32] | None:
+    def beside(self, own: range) -> NDArray[np.bool_]:
+        """(own, cells) whether two cells are in one box of the finest level, or in boxes that touch."""
+        at = self._leaf.keys[self._leaf.of_cell, 2:]
+        return np.asarray(np.abs(at[own.start : own.stop, None] - at).max(axis=-1) <= 1)
+
+    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array, kept: Kept) -> NDArray[np.float32] | None:
         """See `Pairs.turned`."""
-        return self._pairs.turned(near, sign, numbers, q)
+        return self._pairs.turned(near, sign, numbers, q, kept)
 
     def between(self, moments: Array) -> tuple[Ints, Array]:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
@@ -248,6 +254,8 @@ class ActingOnEachOther:
         See `Far.jacobian`.
     sign
         -1 of additions to u that are opposite in the images.
+    beside
+        Which of the stored blocks are of nodes of cells in boxes that touch.
     """
 
     near: Stiffness
@@ -256,16 +264,32 @@ class ActingOnEachOther:
     scale: float
     cells: Cells
     sign: float
+    beside: NDArray[np.bool_]
 
     @cached_property
     def stored(self) -> bsr_array:
         """See `assembly.whole.Acting`."""
         return self.near.matrix(self.sign)
 
-    def turned(self, q: Array) -> bsr_array | None:
-        """What is stored, in single precision, where nodes are turned by q (nodes, 4); None of several images."""
-        blocks = self.far.turned(self.near, self.sign, self.cells.numbers, q)
-        return None if blocks is None else bsr_array((blocks, self.near.columns, self.near.starts), self.near.shape)
+    def turned(self, q: Array, *, upper: bool) -> Singles | None:
+        """The blocks beside the diagonal where nodes are turned by q (nodes, 4); None of several images.
+
+        Parameters
+        ----------
+        upper
+            Whether those below the diagonal are left out.
+        """
+        kept = self._upper if upper else self._beside
+        values = self.far.turned(self.near, self.sign, self.cells.numbers, q, kept)
+        return None if values is None else Singles(kept.onto, kept.columns, values, upper)
+
+    @cached_property
+    def _beside(self) -> Kept:
+        return Kept.of(self.near, self.beside, upper=False)
+
+    @cached_property
+    def _upper(self) -> Kept:
+        return Kept.of(self.near, self.beside, upper=True)
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""

@@ -1,14 +1,14 @@
 """Forces of all charges on each other near states at which they were computed, along a path and beside it."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
 
-from magshell_fenicsx.assembly.whole import Blocks
+from magshell_fenicsx.assembly.whole import Blocks, Singles
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 
 Array = NDArray[np.float64]
@@ -19,6 +19,8 @@ OWN = 0.3  # of a change: what newer ones do not have, at least
 STRAIGHT = 0.5  # of a way: along the path, at least
 TURNED = 0.02  # angle by which a node has turned since D was turned: it is turned again
 APART = 0.1  # of the larger one of two places along the path: their distance, at least
+LAST = 6  # products with D that are kept
+ALONG = 0.999  # cosine of the angle between a change and a direction along which forces are then known
 SLOPE = 0.05  # of a way: two states as near as this one to each other tell a slope
 
 
@@ -44,14 +46,14 @@ class Foreseen:
     change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
     """
 
-    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array]) -> None:
-        self._blocks, self._turns = blocks, turns
+    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool) -> None:
+        self._blocks, self._turns, self._alone = blocks, turns, alone  # on one rank
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
         self._D: ActingOnEachOther | None = None
-        self._stored: bsr_array | None = None  # of D, turned to `_turned`
+        self._stored: Singles | None = None  # of D, turned to `_turned`
         self._turned: Array | None = None
-        self._last: tuple[Array, Array] | None = None  # the last u and D u
+        self._products = deque[tuple[Array, Array]](maxlen=LAST)  # the last u and D u
         self._model: tuple[Along, list[tuple[Array, Array]]] | None = None
 
     def learn(self, u: Array, forces: Array) -> None:
@@ -74,8 +76,20 @@ class Foreseen:
         along, changes = self._model = self._model or self._made()
         foreseen, s = self._product(u) + along.rest(u), u - along.base.u
         for q, y in changes:
-            foreseen += (q @ s) * y
+            foreseen = foreseen + (q @ s) * y
         return foreseen
+
+    def knows_along(self, u: Array, step: Array) -> bool:
+        """Whether the forces at two states near each other and u are known, one from the other along a direction."""
+        if not self._points or self._begins(u):
+            return False
+        near, size = SLOPE * self._ways[-1], float(np.linalg.norm(step))
+        for one, other in pairwise(self._points[-1]):
+            change = one.u - other.u
+            way = float(np.linalg.norm(change))
+            if max(way, np.linalg.norm(u - one.u)) < near and abs(change @ step) > ALONG * size * way:
+                return True
+        return False
 
     def _begins(self, u: Array) -> bool:
         """Whether a state is not of the last point."""
@@ -86,11 +100,13 @@ class Foreseen:
         before = self._turned if D is self._D else None
         if before is not None and 2 * np.abs(self._turns(u, before)[:, :3]).max() < TURNED:
             return
-        turned = D.turned(self._turns(u, of_D))
+        turned = D.turned(self._turns(u, of_D), upper=self._alone)
         if turned is None and before is not None:
             return
-        self._D, self._stored, self._turned = D, D.stored if turned is None else turned, u
-        self._last = self._model = None
+        self._D, self._turned = D, u
+        self._stored = Singles.of(D.stored, upper=self._alone) if turned is None else turned
+        self._model = None
+        self._products.clear()
         self._points = [[Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points]
 
     def _made(self) -> tuple["Along", list[tuple[Array, Array]]]:
@@ -110,12 +126,14 @@ class Foreseen:
         return along, changes
 
     def _product(self, u: Array) -> Array:
-        if self._last is None or not np.array_equal(u, self._last[0]):
-            assert self._D
-            assert self._stored is not None
-            others = self._D.times_others(u[:, None]).ravel()
-            self._last = u, np.asarray(self._blocks.times(self._stored, u) + others)
-        return self._last[1]
+        for before, product in self._products:
+            if np.array_equal(u, before):
+                return product
+        assert self._D
+        assert self._stored
+        product = self._blocks.times(self._stored, u)
+        self._products.appendleft((u, product))
+        return product
 
 
 @dataclass(frozen=True)

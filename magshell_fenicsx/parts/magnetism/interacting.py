@@ -73,7 +73,7 @@ class InteractionTerm:
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
         self._blocks = Blocks(self._comm)
-        self._foreseen = Foreseen(self._blocks, self._turns)
+        self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
             None  # beside its nodes and u
         )
@@ -123,6 +123,13 @@ class InteractionTerm:
         self._nodes()  # what is known is forgotten if shape or remanence changed
         foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2]) if self._stiff else None
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
+
+    def knows_along(self, step: Array) -> bool:
+        """See `assembly.whole.WholeTerm`."""
+        self._nodes()
+        there, nodes = whole(self._u), self._u.function_space.dofmap.index_map
+        own = step.reshape(-1, 3)[: nodes.size_local]
+        return self._foreseen.knows_along(there.ravel(), np.concatenate(self._comm.allgather(own)).ravel())
 
     def compile_tangent(self) -> None:
         """A sum over pairs of charges."""
@@ -187,11 +194,12 @@ class InteractionTerm:
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         far, near = self._charged.boxes(nodes, own)
-        beside = np.zeros((local, count), dtype=bool)
-        for cell, row in zip(own, near, strict=True):
-            columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
-            beside[row_of[cell][:, None], columns] = True
-        stiffness = Stiffness(beside, self._scale, row_of, column_of, turn)
+        stored, touching = np.zeros((2, local, count), dtype=bool)
+        for into, pairs in ((stored, near), (touching, far.beside(own))):
+            for cell, row in zip(own, pairs, strict=True):
+                columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
+                into[row_of[cell][:, None], columns] = True
+        stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
         try:
             self._charged.evaluate(nodes, own, stiffness)
         except Touching:
@@ -200,7 +208,7 @@ class InteractionTerm:
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
+            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign, touching[stored])
             for sign in ([1.0, -1.0] if several else [1.0, 1.0])
         )
         return even, odd
@@ -231,7 +239,7 @@ class InteractionTerm:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._seen, self._stiff = given, None, None
-            self._foreseen = Foreseen(self._blocks, self._turns)
+            self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])

@@ -462,37 +462,39 @@ INLINE void turn(const v R[3][3], const v *X, const v *live, v *Y, v *before, v 
     }
 }
 
-/* Blocks (.., 3, 3) of nodes `number` (rows,) and `columns`, turned by the mean of both nodes' rotations q (.., 4) into
-   `turned`; those of an image, unless NULL, added with a sign, by its change Q (3, 3) of the nodes that it is of. The
-   block of a node with itself gets what makes the sum of a row turn with its node, as in a rotation of all. */
-FAST void turn_blocks(int64_t rows, const int32_t *starts, const int32_t *columns, const double *blocks,
-                      const double *of_image, double sign, const double *Q, const int64_t *number, const double *q,
-                      float *turned)
+/* Blocks (.., 3, 3) of nodes `number` (rows,) and `columns`, turned by the mean of both nodes' rotations q (.., 4); of each
+   row those `which`, from `starts` (rows + 1,) on, of which those from `first` (rows,) on go into `turned`, from `onto`
+   (rows + 1,) on. Those of an image, unless NULL, are added with a sign, by its change Q (3, 3) of the nodes that it is of.
+   The block of a node with itself gets what makes the sum of a row turn with its node, as in a rotation of all. */
+FAST void turn_blocks(int64_t rows, const int32_t *starts, const int32_t *which, const int32_t *columns,
+                      const double *blocks, const double *of_image, double sign, const double *Q, const int64_t *number,
+                      const double *q, const int32_t *first, const int32_t *onto, float *turned)
 {
     const double det = Q[0] * (Q[4] * Q[8] - Q[5] * Q[7]) - Q[1] * (Q[3] * Q[8] - Q[5] * Q[6]) +
                        Q[2] * (Q[3] * Q[7] - Q[4] * Q[6]);
     for (int64_t row = 0; row < rows; ++row) {
         const double *mine = q + 4 * number[row];
         v before[9], after[9], own[4], R[3][3];
+        float *to = turned + 9 * ((int64_t)onto[row] - first[row]);
         int64_t diagonal = -1;
         memset(before, 0, sizeof before), memset(after, 0, sizeof after);
         for (int i = 0; i < 4; ++i)
             own[i] = mine[i] + (v){0.0};
         for (int64_t at = starts[row]; at < starts[row + 1]; at += LANES) {
-            int64_t which[LANES], column[LANES];
+            int64_t block[LANES], column[LANES];
             v live, X[9], Y[9], Z[9], other[4], seen[4];
             for (int c = 0; c < LANES; ++c) {
                 const int there = at + c < starts[row + 1];
-                which[c] = there ? at + c : at, column[c] = columns[which[c]], live[c] = there;
+                block[c] = which[there ? at + c : at], column[c] = columns[block[c]], live[c] = there;
                 if (there && column[c] == number[row])
-                    diagonal = which[c];
+                    diagonal = at + c;
             }
             for (int i = 0; i < 4; ++i)
                 gather(q + i, 4, column, other + i);
             for (int image = 0; image < 1 + (of_image != 0); ++image) {
                 const double *from = image ? of_image : blocks;
                 for (int i = 0; i < 9; ++i)
-                    gather(from + i, 9, which, X + i);
+                    gather(from + i, 9, block, X + i);
                 memcpy(seen, other, sizeof seen);
                 if (image) {
                     for (int i = 0; i < 3; ++i) {
@@ -513,8 +515,8 @@ FAST void turn_blocks(int64_t rows, const int32_t *starts, const int32_t *column
                         Y[3 * i + j] += sign * (Z[3 * i] * Q[j] + Z[3 * i + 1] * Q[3 + j] + Z[3 * i + 2] * Q[6 + j]);
             }
             for (int c = 0; c < LANES && at + c < starts[row + 1]; ++c)
-                for (int i = 0; i < 9; ++i)
-                    turned[9 * (at + c) + i] = (float)Y[i][c];
+                for (int i = 0; i < 9 && at + c >= first[row]; ++i)
+                    to[9 * (at + c) + i] = (float)Y[i][c];
         }
         if (diagonal < 0)
             continue;
@@ -528,7 +530,7 @@ FAST void turn_blocks(int64_t rows, const int32_t *starts, const int32_t *column
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) {
                 const double one = sum[3 * i + j][0] - after[3 * i + j][0], two = sum[3 * j + i][0] - after[3 * j + i][0];
-                turned[9 * diagonal + 3 * i + j] += (float)((one + two) / 2.0);
+                to[9 * diagonal + 3 * i + j] += (float)((one + two) / 2.0);
             }
     }
 }
