@@ -19,8 +19,9 @@ from magshell_fenicsx.assembly.whole import Singles
 from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
 from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
-from magshell_fenicsx.parts.magnetism.pairs import Kept, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
+from magshell_fenicsx.parts.magnetism.turned import Kept, Turning
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -179,10 +180,6 @@ class Far:
         at = self._leaf.keys[self._leaf.of_cell, 2:]
         return np.asarray(np.abs(at[own.start : own.stop, None] - at).max(axis=-1) <= 1)
 
-    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array, kept: Kept) -> NDArray[np.float32] | None:
-        """See `Pairs.turned`."""
-        return self._pairs.turned(near, sign, numbers, q, kept)
-
     def between(self, moments: Array) -> tuple[Ints, Array]:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
@@ -265,31 +262,20 @@ class ActingOnEachOther:
     cells: Cells
     sign: float
     beside: NDArray[np.bool_]
+    turning: Turning
 
     @cached_property
     def stored(self) -> bsr_array:
         """See `assembly.whole.Acting`."""
         return self.near.matrix(self.sign)
 
-    def turned(self, q: Array, *, upper: bool) -> Singles | None:
-        """The blocks beside the diagonal where nodes are turned by q (nodes, 4); None of several images.
-
-        Parameters
-        ----------
-        upper
-            Whether those below the diagonal are left out.
-        """
-        kept = self._upper if upper else self._beside
-        values = self.far.turned(self.near, self.sign, self.cells.numbers, q, kept)
-        return None if values is None else Singles(kept.onto, kept.columns, values, upper)
+    def turned(self, q: Array) -> Singles | None:
+        """The blocks `beside` where nodes are turned by q (nodes, 4); None of several images."""
+        return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept)
 
     @cached_property
-    def _beside(self) -> Kept:
-        return Kept.of(self.near, self.beside, upper=False)
-
-    @cached_property
-    def _upper(self) -> Kept:
-        return Kept.of(self.near, self.beside, upper=True)
+    def _kept(self) -> Kept:
+        return self.turning.kept(self.near, self.beside)
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""

@@ -41,9 +41,11 @@ class Known:
 class Foreseen:
     """Forces near states at which they were computed, by an earlier second derivative D and by what D lacks.
 
-    Along the path, the forces without D u are a polynomial through its last points. It has slopes at points where two
-    states near each other are known. Changes of u beside the path correct D and the polynomial by secants, the newest
-    change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth along the path, and
+    small beside it. Along the path, the forces without D u are a polynomial through its last points. It has slopes at
+    points where two states near each other are known. Changes of u beside the path correct D and the polynomial by
+    secants, the newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several
+    steps).
     """
 
     def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool) -> None:
@@ -85,9 +87,9 @@ class Foreseen:
             return False
         near, size = SLOPE * self._ways[-1], float(np.linalg.norm(step))
         for one, other in pairwise(self._points[-1]):
-            change = one.u - other.u
+            change, away = one.u - other.u, float(np.linalg.norm(u - one.u))
             way = float(np.linalg.norm(change))
-            if max(way, np.linalg.norm(u - one.u)) < near and abs(change @ step) > ALONG * size * way:
+            if max(way, away) < near and abs(change @ step) > ALONG * size * way:
                 return True
         return False
 
@@ -100,7 +102,7 @@ class Foreseen:
         before = self._turned if D is self._D else None
         if before is not None and 2 * np.abs(self._turns(u, before)[:, :3]).max() < TURNED:
             return
-        turned = D.turned(self._turns(u, of_D), upper=self._alone)
+        turned = D.turned(self._turns(u, of_D))
         if turned is None and before is not None:
             return
         self._D, self._turned = D, u

@@ -25,6 +25,7 @@ from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
+from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen: tuple[Array, float, Array] | None = None
-        self._blocks = Blocks(self._comm)
+        self._blocks, self._turning = Blocks(self._comm), Turning(self._comm)
         self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
             None  # beside its nodes and u
@@ -208,7 +209,7 @@ class InteractionTerm:
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign, touching[stored])
+            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign, touching[stored], self._turning)
             for sign in ([1.0, -1.0] if several else [1.0, 1.0])
         )
         return even, odd

@@ -15,7 +15,6 @@ from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Indices = NDArray[np.int32]
 LANES, SUMS = 8, 24  # as in pairs.c
 FUNCTIONS = """
     double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *,
@@ -28,8 +27,6 @@ FUNCTIONS = """
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
         int64_t, const double *, const double *, double *);
-    void turn_blocks(int64_t, const int32_t *, const int32_t *, const int32_t *, const double *, const double *, double,
-        const double *, const int64_t *, const double *, const int32_t *, const int32_t *, float *);
 """
 INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
 KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
@@ -152,37 +149,6 @@ class Stiffness:
         )
 
 
-@dataclass(frozen=True)
-class Kept:
-    """Some of the blocks of a `Stiffness`.
-
-    Attributes
-    ----------
-    starts, which
-        Of each row of blocks, their numbers.
-    first
-        Which of these is the first one of its row that is stored.
-    onto, columns
-        Starts of rows and columns of what is stored.
-    """
-
-    starts: Indices
-    which: Indices
-    first: Indices
-    onto: Indices
-    columns: Indices
-
-    @classmethod
-    def of(cls, stiffness: Stiffness, some: NDArray[np.bool_], *, upper: bool) -> "Kept":
-        """Some (blocks,) of all; if `upper`, those below the diagonal are not stored."""
-        which = np.flatnonzero(some).astype(np.int32)
-        starts = np.append(0, np.cumsum(some, dtype=np.int32))[stiffness.starts].astype(np.int32)
-        rows, columns = np.repeat(np.arange(len(starts) - 1), np.diff(starts)), stiffness.columns[which]
-        stored = columns >= (rows if upper else 0)
-        onto = np.append(0, np.cumsum(stored, dtype=np.int32))[starts].astype(np.int32)
-        return cls(starts, which, (starts[1:] - np.diff(onto)).astype(np.int32), onto, columns[stored])
-
-
 class Pairs:
     """The sums over pairs of cells with nodes (cells, k, 3)."""
 
@@ -296,23 +262,6 @@ class Pairs:
             self._lib.translate(
                 len(one), *numbers, M.shape[1], p(ends), G.shape[1], M.shape[2], *(p(each) for each in arrays), p(L)
             )
-
-    def turned(
-        self, stiffness: Stiffness, sign: float, number: Ints, q: Array, kept: Kept
-    ) -> NDArray[np.float32] | None:
-        """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes, 4), scalar last.
-
-        None where there are several images, whose blocks are not stored apart.
-        """
-        count = len(stiffness.columns)
-        if len(stiffness.turn) > 2:
-            return None
-        p, turned = self._pointer, np.empty((len(kept.columns), 3, 3), dtype=np.float32)
-        images = p(stiffness.blocks[count:]) if len(stiffness.turn) > 1 else self._ffi.NULL
-        arrays = p(kept.starts), p(kept.which), p(stiffness.columns), p(stiffness.blocks[:count]), images
-        onto = p(kept.first), p(kept.onto), p(turned)
-        self._lib.turn_blocks(len(kept.first), *arrays, sign, p(stiffness.turn[-1]), p(number), p(q), *onto)
-        return turned
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
