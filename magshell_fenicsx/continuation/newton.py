@@ -152,9 +152,9 @@ class BorderedNewton:
         reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
         return Outcome(guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error)
 
-    def stand_at(self, state: State) -> None:
-        """Factor the tangent at a state where no factors of this solver stand, as in a resumed run."""
-        if self._tangents.state is None:
+    def stand_at(self, state: State, most: float = np.inf) -> None:
+        """Factor the tangent at a state if no factors stand within so many lengths of it, as in a resumed run."""
+        if not self._tangents.near(state, most):
             self._tangents.at(state, sure=False)
 
     def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:

@@ -24,6 +24,7 @@ from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot
 
 Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
+Arrive = Callable[[float, Sequence[Point]], float]
 MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
 MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
 BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
@@ -130,7 +131,7 @@ class Path:
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         guess, near = self.between(s, low, high), None if counted else high.state
-        return self.solve(self._row(s, base), s, guess, stress, near=near)
+        return self.solve(self._row(s, base), s, guess, stress, near=near, counted=counted)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
         """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
@@ -167,12 +168,29 @@ class Path:
         *,
         near: State | None = None,
         most: float = np.inf,
+        counted: bool = True,
     ) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
 
-        With a solution near by, old factors may begin, and the number of unstable directions means nothing.
+        With a solution `near` by, old factors may begin. Unless `counted`, nobody asks for unstable directions.
         """
-        point = self.recorded(lambda: self._solve(row, s, guess, stress, near, most))
+        old = NEAR if near else 0.0  # a tangent of the path must not depend on what was factored before its point
+
+        def find() -> Point | str:
+            if near:
+                close = counted and max_abs(self.system.comm, guess.u - near.u) < NEAR * self.system.length
+                self.newton.stand_at(near, NEAR if close else np.inf)
+            before, search = self.newton.factorisation.count, self._vain < VAIN
+            outcome = self.newton.solve(guess, self.name, row, stress, search=search, near=old, most=most)
+            if not outcome.converged:
+                return outcome.reason
+            spent = self.newton.factorisation.count - before
+            exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
+            response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
+            found = self._point(outcome.state, s, response)
+            return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
+
+        point = self.recorded(find)
         self._hard += point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
@@ -225,10 +243,13 @@ class Path:
         """The row that holds the amplitude, or the displacement conjugate to it, at a target."""
         return GivenLoad(self.name, target) if quantity == "load" else GivenConjugate(self.system, self.name, target)
 
-    def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
+    def towards(
+        self, start: Point, targets: Sequence[float], arrive: Arrive = lambda s, seen: s
+    ) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag marks the targets.
 
         A point that was found too far away is looked at again from the next points: it is a step of theirs for nothing.
+        `arrive` may shorten a step to some s that is foreseen from some points.
 
         Raises
         ------
@@ -247,10 +268,9 @@ class Path:
                 if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
                     length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
-                seen = passed[-3:] if smooth else passed[-2:]
-                part, sets_in = (
-                    self._setting_in(here.state, self._extended(s, seen)) if here is not vain else (1.0, False)
-                )
+                s = arrive(s, seen := passed[-3:] if smooth else passed[-2:])
+                ahead = here is not vain
+                part, sets_in = self._setting_in(here.state, self.extended(s, seen)) if ahead else (1.0, False)
                 if not part:
                     seen, part = passed[-1:], 1.0
                 s = here.s + part * (s - here.s) if part < 1 else s
@@ -303,17 +323,17 @@ class Path:
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
         """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""
-        cubic, quintic = (self._extended(s, passed[-count:]).u for count in (2, 3))
+        cubic, quintic = (self.extended(s, passed[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
         allowed = max(GUESSED * self.system.length, WORSE * missed)
         return min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:
         """How far a point is from where earlier ones led."""
-        guess = self._extended(self.measured_from(passed[-1], point).s, passed)
+        guess = self.extended(self.measured_from(passed[-1], point).s, passed)
         return max_abs(self.system.comm, guess.u - point.state.u)
 
-    def _extended(self, s: float, passed: Sequence[Point]) -> State:
+    def extended(self, s: float, passed: Sequence[Point]) -> State:
         """A state at `s`, of the polynomial through points with their tangents; arc length is from the last.
 
         Points before a turn of s do not count.
@@ -346,7 +366,7 @@ class Path:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
-        guess = self._extended(s, passed)
+        guess = self.extended(s, passed)
         moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
         grows = self.newton.options.kinks  # steps may, where forces set in; given up there, they end beside the path
         point = self.at(s, guess, here, most=np.inf if grows else max(WILD * moved, LEAST_MOST))
@@ -400,22 +420,6 @@ class Path:
         if lengths < SEEN**2:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
-
-    def _solve(
-        self, row: Row, s: float, guess: State, stress: Sequence[Weighted], near: State | None, most: float
-    ) -> Point | str:
-        if near:
-            self.newton.stand_at(near)
-        before = self.newton.factorisation.count
-        old = NEAR if near else 0.0  # a tangent of the path must not depend on what was factored before its point
-        outcome = self.newton.solve(guess, self.name, row, stress, search=self._vain < VAIN, near=old, most=most)
-        if not outcome.converged:
-            return outcome.reason
-        spent = self.newton.factorisation.count - before
-        exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-        response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=not near)
-        point = self._point(outcome.state, s, response)
-        return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""

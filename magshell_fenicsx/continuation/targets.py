@@ -5,9 +5,21 @@ from collections.abc import Callable, Iterator, Sequence
 from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
 
+BEHIND = 1.01  # of the way to the last target: a step ends there, so that its factors serve at the target
 JOINED, APART = 4, 0.1  # points that a polynomial goes through, and their least distance over that around a target
 MOST_TRIALS = 20
 CLOSE = 1e-6  # of the way that is left between two places: nearer ones are the same
+
+
+def arriving(path: Path, quantity: Quantity, target: float, s: float, seen: Sequence[Point]) -> float:
+    """The end of a step to `s`: close behind the last target, where points foresee that it is passed."""
+    here = seen[-1].s
+
+    def missed(s: float) -> float:
+        return path.value(quantity, path.extended(s, seen)) - target
+
+    passed = missed(here) * missed(s) < 0
+    return here + min(BEHIND * (_zero(missed, here, s) - here) / (s - here), 1.0) * (s - here) if passed else s
 
 
 def targets_between(
@@ -55,7 +67,7 @@ def _solved(path: Path, quantity: Quantity, target: float, around: Sequence[Poin
     s = _zero(missed, low.s, high.s)
     t = (s - low.s) / (high.s - low.s)
     stress = [(1 - t, low.state.u), (t, high.state.u)]
-    point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress)
+    point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress, near=high.state)
     if isinstance(point, str):
         raise PathStopped(point, low)
     return point

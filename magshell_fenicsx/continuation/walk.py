@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted, max_abs
-from magshell_fenicsx.continuation.targets import targets_between
+from magshell_fenicsx.continuation.targets import arriving, targets_between
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
@@ -357,7 +357,7 @@ class Walk:
         """
         options, shorter, why = self.path.options, None, ""
         while True:
-            for point, reached in self.path.towards(self.points[-1], self._ahead()):
+            for point, reached in self.path.towards(self.points[-1], self._ahead(), self._arrive):
                 low, shorter = self.points[-1], None
                 try:
                     state = self._renew(low, point) if self._renew else None
@@ -420,6 +420,12 @@ class Walk:
             return [float(np.copysign(np.inf, goal.sense))]
         sense = goal.targets[-1] - self.points[0].s
         return [t for t in goal.targets if (t - s) * sense > 0]
+
+    def _arrive(self, s: float, seen: Sequence[Point]) -> float:
+        """The end of a step; by arc length, it passes the last target of the walk by little."""
+        goal = self.goal
+        ends = self._by_arc and goal.targets and goal.until in ("target", "limit")
+        return arriving(self.path, goal.quantity, goal.targets[-1], s, seen) if ends else s
 
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
         """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""

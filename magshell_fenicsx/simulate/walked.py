@@ -19,6 +19,7 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import recut, refuse_crossing, refuse_passing, refuse_return, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
+ASKED = 1 / 16  # of the first step: where load control fails in so short a step, a fold is looked for first
 
 
 Records = Generator[Record, None, State]  # records, and the model's state at the end
@@ -81,7 +82,11 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     """The same with the points of the stage's system; the state at the end of the last walk."""
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
-    crossing, fold, lost, watch = None, "", "", stage.scene.watch
+    finest = path.options.smallest
+    if path.control == "load" and goal.targets:
+        walk.path = _asking(path, path.options.first, finest)
+    ahead: list[Record] = []  # a fold that load control cannot pass
+    crossing, fold, lost, final, watch = None, "", "", False, stage.scene.watch
     furthest = np.inf  # amplitude, once an excluded mode is unstable
     for applied in stage.scene.model.fields:
         applied.lost = ""
@@ -110,8 +115,7 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 if abs(point.state.mu[path.name]) > furthest:
                     break
         except PathStopped as e:
-            lost = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere()
-            onward = None if e.final else _onward(stage, walk)
+            lost, final = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere(), e.final
         excluded = list(_excluded(path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]
@@ -120,17 +124,17 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         yield from excluded
         if excluded and goal.until == "limit":
             furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
+        if lost:
+            ahead, onward = _beyond(stage, walk, finest, final=final)
         if onward:
-            stage.scene.progress.doing("going on by arc length")
+            stage.scene.progress.doing("going on by arc length" if onward.path.control == "arc" else "in shorter steps")
             lost = ""
             watch.begin(onward.path, onward.points[0], stage.leave)
-    if lost and path.control == "load" and goal.targets:
-        for record in _fold_ahead(stage, path, walk.points):
-            yield record
-            if record.label == "fold":
-                at = amount(stage.scene, path.name, record.point.state.mu[path.name])
-                target = amount(stage.scene, path.name, goal.targets[-1])
-                lost = f"load control cannot pass the fold at {at}, before its target, {target}; {lost}"
+    yield from ahead
+    if ahead:
+        at = amount(stage.scene, path.name, ahead[-1].point.state.mu[path.name])
+        target = amount(stage.scene, path.name, goal.targets[-1])
+        lost = f"load control cannot pass the fold at {at}, before its target, {target}; {lost}"
     if watch.unlocated:
         why = f"a mode that the reduced model excludes is unstable from an unknown point on: {watch.unlocated}"
         lost = f"{lost}; {why}" if lost else why
@@ -139,6 +143,27 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     if branches and crossing:
         yield from _branches(stage, path, crossing, goal, branches)
     return walk.points[-1].state
+
+
+def _beyond(stage: Stage, walk: Walk, finest: float, *, final: bool) -> tuple[list[Record], Walk | None]:
+    """What ends a walk that has stopped, a fold with the excluded instabilities before it; or the walk that goes on.
+
+    Under load control it goes on in steps down to `finest`, unless a fold explains why the last step failed.
+    """
+    path, goal, last = walk.path, walk.goal, walk.points[-1]
+    if path.control != "load" or not goal.targets:
+        return [], None if final else _onward(stage, walk)
+    shortest = path.options.smallest
+    last_resort = final or shortest <= finest
+    ahead = _fold_ahead(stage, walk, np.inf if last_resort else 2 * shortest)
+    if ahead or last_resort:
+        return ahead, None
+    return [], _walk(stage, _asking(path, shortest, finest), last, goal)
+
+
+def _asking(path: Path, first: float, finest: float) -> Path:
+    """The path in steps that end early, to look for a fold."""
+    return path.in_steps(replace(path.options, first=first, smallest=max(finest, ASKED * first)))
 
 
 def _onward(stage: Stage, walk: Walk) -> Walk | None:
@@ -205,22 +230,28 @@ def _by_arc(stage: Stage, path: Path) -> Path:
     return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
 
 
-def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
-    """The fold that ended a path under load control, located by arc length, after any excluded instabilities."""
-    onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
-    by_arc, start = stage.resume(path.name, "arc", points[-1].state, onward, path.metric.scale)
+def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
+    """The fold that ended a path under load control, located by arc length, after any excluded instabilities.
+
+    None if there is none `within` so small a change of the load.
+    """
+    path, points, name = walk.path, walk.points, walk.path.name
+    last = points[-1]
+    first = np.copysign(path.options.first, walk.goal.targets[-1] - last.s)
+    onward = last.s - points[-2].s if len(points) > 1 else float(first)
+    by_arc, start = stage.resume(name, "arc", last.state, onward, path.metric.scale)
     stage.scene.watch.begin(by_arc, start, stage.leave)
     passed: list[Record] = []
     try:
         for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
             passed += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
+            if abs(point.state.mu[name] - last.s) > within:
+                return []
+            if label == "fold":
+                return [*passed, Record(label, name, point, excluded_pivots=stage.scene.watch.unstable)]
     except PathStopped:
-        return []
-    return (
-        [*passed, Record(label, path.name, point, excluded_pivots=stage.scene.watch.unstable)]
-        if label == "fold"
-        else []
-    )
+        pass
+    return []
 
 
 def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:

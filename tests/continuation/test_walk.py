@@ -61,6 +61,16 @@ def test_targets_are_met_on_every_part_of_the_path() -> None:
     assert np.sort(loads)[:3] == pytest.approx(np.sort(np.roots([1, -3, 2, -0.1]).real), abs=1e-9)
 
 
+@pytest.mark.parametrize("largest", [0.2, 0.6])
+def test_a_walk_ends_close_behind_its_last_target(largest: float) -> None:
+    """The factors of the step behind it serve there too, and the state is the toy's own."""
+    label, point = walked(Goal("target", [0.3], "load"), 0.05, largest)[-1]
+    assert (label, point.factorisations) == ("target", 0)
+    root = np.roots([1, -3, 2, -0.3]).real.min()
+    assert point.state.u[1] == pytest.approx(root, abs=1e-9)
+    assert (point.negative_pivots, point.negative_pivots_held) == (0, 0)
+
+
 @pytest.mark.parametrize(("until", "x"), [("limit", FOLDS[0]), ("bifurcation", C)])
 def test_walk_ends_where_it_shall(until: str, x: float) -> None:
     label, point = walked(Goal(until))[-1]  # type: ignore[arg-type]

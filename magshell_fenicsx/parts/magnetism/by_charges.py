@@ -16,6 +16,8 @@ from magshell_fenicsx.parts.magnetism.pairs import Points
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int64]
+Elements = tuple[Points, Ints]  # points on elements of a kind, and the rows of these
+Placed = tuple[list[Complex], list[Complex]]  # components (n, 1 or P, charges) of places and of normals
 CHUNK = 400_000  # pairs of charges at once
 
 
@@ -44,59 +46,50 @@ def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex
 
 
 def add(
-    nodes: Complex, cells: Ints, left: tuple[Points, Ints], right: tuple[Points, Ints], weights: Weights
+    nodes: Complex, cells: Ints, left: Elements, right: Elements, weights: Weights, *, heights: bool = False
 ) -> tuple[Array, Array]:
-    """Derivatives by the charges of the left and of the right points, like `Points.q`, of sums over pairs (n, 2)."""
+    """Derivatives by the charges of the left and of the right points, like `Points.q`, of sums over pairs (n, 2).
+
+    Or those by the `heights` of the charges over the mid-surface.
+    """
     one, other = (np.zeros_like(points.q) for points, _ in (left, right))
     same = right[0].tables.ndim == 3
     size = left[0].q[0].size * (right[0].q[0].size if same else right[0].q[0, 0].size)
-    step = max(1, CHUNK // size)
-    for first in range(0, len(cells), step):
-        some = slice(first, first + step)
-        x, y = (places(of, rows[some], nodes[cells[some, i]])[2] for i, (of, rows) in enumerate((left, right)))
-        n, P = x.shape[:2]
-        x, y = (np.moveaxis(each.reshape(n, 1 if same else P, -1, 3), -1, 0)[:, :, :, :, None] for each in (x, y))
-        along = [
-            a - b.swapaxes(2, 3) for a, b in zip(*(np.ascontiguousarray(each.real) for each in (x, y)), strict=True)
-        ]
-        rate = [a - b.swapaxes(2, 3) for a, b in zip(*(each.imag / STEP for each in (x, y)), strict=True)]
-        inverse = 1 / np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)  # (n, 1 or P, left, right)
-        rising = along[0] * rate[0] + along[1] * rate[1] + along[2] * rate[2]
-        seen = weights.energy * inverse - weights.force * inverse**2 * inverse * rising
-        q, p = (of.q[rows[some]].reshape(n, inverse.shape[1], -1) for of, rows in (left, right))
-        np.add.at(one, left[1][some], (seen @ p[..., None])[..., 0].reshape(n, *one.shape[1:]))
-        np.add.at(other, right[1][some], (q[..., None, :] @ seen)[..., 0, :].reshape(n, *other.shape[1:]))
-    return one, other
-
-
-def add_heights(
-    nodes: Complex, cells: Ints, left: tuple[Points, Ints], right: tuple[Points, Ints], weights: Weights
-) -> tuple[Array, Array]:
-    """As `add`, by the heights of the charges over the mid-surface."""
-    one, other = (np.zeros_like(points.q) for points, _ in (left, right))
-    same = right[0].tables.ndim == 3
-    size = left[0].q[0].size * (right[0].q[0].size if same else right[0].q[0, 0].size)
-    step = max(1, CHUNK // (4 * size))
+    step, found = max(1, CHUNK // (4 * size if heights else size)), _by_heights if heights else _by_charges
     for first in range(0, len(cells), step):
         some = slice(first, first + step)
         x, y = (_along(of, rows[some], nodes[cells[some, i]], same) for i, (of, rows) in enumerate((left, right)))
-        d = [a[..., :, None] - b[..., None, :] for a, b in zip(x[0], y[0], strict=True)]
-        square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        share = 1 / (square * np.sqrt(square))
-        q, p = (of.q[rows[some]].reshape(len(square), square.shape[1], -1) for of, rows in (left, right))
-        on_one, on_other = np.zeros(x[0][0].shape, complex), np.zeros(y[0][0].shape, complex)
-        for each, n, m in zip(d, x[1], y[1], strict=True):
-            force = share * each
-            on_one -= n * (force @ p[..., None])[..., 0]
-            on_other += m * (q[..., None, :] @ force)[..., 0, :]
-        for total, of, on in ((one, left, q * on_one), (other, right, p * on_other)):
-            seen = weights.energy * on.real + weights.force * on.imag / STEP
-            np.add.at(total, of[1][some], seen.reshape(len(seen), *total.shape[1:]))
+        q, p = (of.q[rows[some]].reshape(*z[0][0].shape) for (of, rows), z in ((left, x), (right, y)))
+        for total, (_, rows), on in zip((one, other), (left, right), found(x, y, q, p, weights), strict=True):
+            np.add.at(total, rows[some], on.reshape(len(on), *total.shape[1:]))
     return one, other
 
 
-def _along(points: Points, rows: Ints, nodes: Complex, same: bool) -> tuple[list[Complex], list[Complex]]:
-    """Components (n, 1 or P, charges) of places and normals of points of elements `rows`."""
+def _by_charges(x: Placed, y: Placed, q: Array, p: Array, weights: Weights) -> tuple[Array, Array]:
+    parts = [[(np.ascontiguousarray(c.real), c.imag / STEP) for c in each[0]] for each in (x, y)]
+    along, rate = (
+        [a[i][..., :, None] - b[i][..., None, :] for a, b in zip(*parts, strict=True)] for i in range(2)
+    )  # (n, 1 or P, left, right)
+    inverse = 1 / np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)
+    rising = along[0] * rate[0] + along[1] * rate[1] + along[2] * rate[2]
+    seen = weights.energy * inverse - weights.force * inverse**2 * inverse * rising
+    return (seen @ p[..., None])[..., 0], (q[..., None, :] @ seen)[..., 0, :]
+
+
+def _by_heights(x: Placed, y: Placed, q: Array, p: Array, weights: Weights) -> tuple[Array, Array]:
+    d = [a[..., :, None] - b[..., None, :] for a, b in zip(x[0], y[0], strict=True)]
+    square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    share = 1 / (square * np.sqrt(square))
+    on_one, on_other = np.zeros(q.shape, complex), np.zeros(p.shape, complex)
+    for each, n, m in zip(d, x[1], y[1], strict=True):
+        force = share * each
+        on_one -= n * (force @ p[..., None])[..., 0]
+        on_other += m * (q[..., None, :] @ force)[..., 0, :]
+    one, other = (weights.energy * on.real + weights.force * on.imag / STEP for on in (q * on_one, p * on_other))
+    return one, other
+
+
+def _along(points: Points, rows: Ints, nodes: Complex, same: bool) -> Placed:
     _, n, x = places(points, rows, nodes)
     shape = len(x), 1 if same else x.shape[1], -1, 3
     each = x.reshape(shape), np.broadcast_to(n[..., None, :], x.shape).reshape(shape)

@@ -18,7 +18,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Weights, add, add_heights
+from magshell_fenicsx.parts.magnetism.by_charges import Weights, add
 from magshell_fenicsx.parts.magnetism.charged import STEP, Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.far import Far
@@ -253,11 +253,11 @@ class Charged:
         rules, moved = self.rules(nodes, own), nodes + STEP * 1j * rates
         into = self._shape.nothing(of_shape=of_shape)
         far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
-        found = far.by_charges(nodes, moved, cells_far, weights)
-        for kind, on_q, on_heights in zip(self._kinds, *found, strict=True):
+        on_far = far.by_charges(nodes, moved, cells_far, weights, heights=of_shape)
+        for kind, (on_q, *on_heights) in zip(self._kinds, on_far, strict=True):
             kind.back(FAR, on_q, into)
-            if of_shape:
-                kind.back_of_heights(FAR, on_heights, into)
+            for on in on_heights:
+                kind.back_of_heights(FAR, on, into)
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own.start
         for number in map(int, np.unique(which)):
@@ -268,7 +268,7 @@ class Charged:
                 left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
                 one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
                 if of_shape:
-                    one.back_of_heights(number, add_heights(moved, cells[charged], left, right, weights)[0], into)
+                    one.back_of_heights(number, add(moved, cells[charged], left, right, weights, heights=True)[0], into)
         if self._near:
             self._near.by_fields(moved, weights, into)
         return into

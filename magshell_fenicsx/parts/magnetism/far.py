@@ -114,11 +114,17 @@ class Far:
         return float(energy)
 
     def by_charges(
-        self, nodes: Array, moved: Complex, kinds: Sequence[tuple[Ints, Points]], weights: Weights
-    ) -> tuple[list[Array], list[Array]]:
-        """Derivatives of the energy of all, and of its rate, like `Points.q` of each kind, of own cells.
+        self,
+        nodes: Array,
+        moved: Complex,
+        kinds: Sequence[tuple[Ints, Points]],
+        weights: Weights,
+        *,
+        heights: bool = False,
+    ) -> list[list[Array]]:
+        """Derivatives of the energy of all, and of its rate, by the charges, of own cells: of each kind, like `q`.
 
-        Those by the charges, and those by their heights over the mid-surface.
+        Beside each, if asked for, those by the `heights` of the charges over the mid-surface.
 
         Parameters
         ----------
@@ -127,29 +133,32 @@ class Far:
         """
         Y, N, width = self.placed(nodes).Y, derivatives(), self._leaf.width
         at = [places(points, np.arange(len(points.q)), moved[cells]) for cells, points in kinds]
-        normals = [np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3) for _, n, x in at]
-        rate = np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag / STEP / width
-        upwards = np.concatenate(normals)[self._order] / width
-        n, dn = upwards.real, upwards.imag / STEP
 
         def along(v: NDArray[np.floating[Any]], Y: Array) -> Array:
             return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
-        dY, nY = along(rate, Y), along(n, Y)
-        dnY = np.asarray(along(rate, nY) + along(dn, Y))
+        rate = np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag / STEP / width
+        dY = along(rate, Y)
         L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
-        by = np.empty((2, len(self._q)))
-        for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
-            for i, (y, dy) in enumerate(((Y, dY), (nY, dnY))):
-                y, dy = y[:, first:end], dy[:, first:end]
-                of = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
-                by[i, self._order[first:end]] = (self._q[first:end] if i else 1.0) * of / width
+        wanted: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
+        if heights:
+            normals = [np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3) for _, n, x in at]
+            upwards = np.concatenate(normals)[self._order] / width
+            n, dn = upwards.real, upwards.imag / STEP
+            nY = along(n, Y)
+            wanted.append((self._q, nY, np.asarray(along(rate, nY) + along(dn, Y))))
         split = np.cumsum([points.q.size for _, points in kinds])[:-1]
-        each = zip(*(np.split(values, split) for values in by), kinds, self._own, strict=True)
-        parts = [
-            [part.reshape(points.q.shape) * own[:, None, None] for part in both] for *both, (_, points), own in each
-        ]
-        return [part[0] for part in parts], [part[1] for part in parts]
+        found = list[list[Array]]()
+        for factor, values, rates in wanted:
+            by = np.empty(len(self._q))
+            for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
+                y, dy = values[:, first:end], rates[:, first:end]
+                of = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
+                by[self._order[first:end]] = of / width
+            by[self._order] *= factor
+            each = zip(np.split(by, split), kinds, self._own, strict=True)
+            found.append([part.reshape(points.q.shape) * own[:, None, None] for part, (_, points), own in each])
+        return [list(each) for each in zip(*found, strict=True)]
 
     def _summed(self, values: Array) -> Array:
         """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of boxes."""

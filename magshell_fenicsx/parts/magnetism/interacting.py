@@ -54,7 +54,6 @@ class InteractionTerm:
     """
 
     group, column = "magnetic", "magnetic"
-    no_number = " (parts touch or nearly do, and magnetism does not keep them apart: name them in contact)"
 
     def __init__(self, model: "Observed", u: fem.Function, of: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE
@@ -78,6 +77,13 @@ class InteractionTerm:
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
             None  # beside its nodes and u
         )
+
+    @property
+    def no_number(self) -> str:
+        """What is said where it is not a number."""
+        if self._model.touchings:
+            return " (parts are in each other, or too near for the size of their cells: take smaller ones)"
+        return " (parts touch or nearly do, and magnetism does not keep them apart: name them in contact)"
 
     def antisymmetric(self) -> "InteractionTerm":
         """The same term for additions to u that are opposite in the images."""

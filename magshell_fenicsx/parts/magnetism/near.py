@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add, add_heights
+from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Found, Sides, gauss, heights
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
@@ -338,7 +338,7 @@ class Near:
 
     def _by_heights(self, batch: Batch, pairs: Ints, moved: Complex, weights: Weights, into: Nodal) -> None:
         rows, both = np.arange(len(pairs)), (batch.left, batch.right)
-        on = add_heights(moved, pairs, (batch.left, rows), (batch.right, rows), weights)
+        on = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights, heights=True)
         for i, (places, _, _) in enumerate((batch.of_left, batch.of_right)):
             copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
             shape = len(pairs), len(places.weights), -1
