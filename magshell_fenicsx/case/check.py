@@ -16,6 +16,7 @@ from magshell_fenicsx.problem.names import open_edges
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.problem.sizes import degree_of
 from magshell_fenicsx.shape.sections import FLAT
+from magshell_fenicsx.simulate.overlap import refuse_overlap
 
 
 def describe(case: Case, problem: Problem | None = None) -> str:
@@ -61,6 +62,7 @@ def _described(case: Case, problem: Problem) -> str:
     if case.mesh.tolerance is None:
         patch = None if problem.axisymmetric else problem.triangulated()
         cells, unknowns = _count(problem, patch)
+        refuse_overlap(problem, cells)
         lines.append(f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns")
         if patch and isinstance(problem.shape, MeshFile):
             lines += _surface(patch)

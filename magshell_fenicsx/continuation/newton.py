@@ -19,9 +19,9 @@ from magshell_fenicsx.continuation.snes import (
     FAR,
     HIDDEN,
     IN_WORDS,
+    LatestTangent,
     Linearised,
     NewtonOptions,
-    Tangents,
     make_snes,
 )
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
@@ -76,8 +76,8 @@ class BorderedNewton:
         self.options = options or NewtonOptions()
         self.factorisation = factorisation or Factorisation(system.comm)
         self._work = _Work()
-        self._tangents = Tangents(system, self.factorisation)
-        self._linear = Linearised(self._tangents, self.options)
+        self._tangent = LatestTangent(system, self.factorisation)
+        self._linear = Linearised(self._tangent, self.options)
         self._x = self._linear.vector()
         self._snes = make_snes(self._linear, self._x, self.options)
         kinks = self.options.kinks
@@ -118,7 +118,7 @@ class BorderedNewton:
         most
             A longer step, in lengths, ends the solve early, and so do steps that lead astray: see `Iterates.hasty`.
         """
-        outcome = self._solved(self._snes, guess, name, row, stress, near, most, foreseeing=self._tangents.foresees)
+        outcome = self._solved(self._snes, guess, name, row, stress, near, most, foreseeing=self._tangent.foresees)
         far = outcome.reason in (DIVERGED, FAR)
         if not outcome.converged and self._linear.foreseeing and not (far and not self._linear.misled()):
             outcome = self._solved(self._snes, guess, name, row, stress, near, most)
@@ -154,8 +154,8 @@ class BorderedNewton:
 
     def stand_at(self, state: State, most: float = np.inf) -> None:
         """Factor the tangent at a state if no factors stand within so many lengths of it, as in a resumed run."""
-        if not self._tangents.near(state, most):
-            self._tangents.at(state, sure=False)
+        if not self._tangent.near(state, most):
+            self._tangent.at(state, sure=False)
 
     def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:
         """A guess after one step, of at most so many lengths, with the factors that stand; None if it is longer."""
@@ -169,7 +169,7 @@ class BorderedNewton:
 
     def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are known."""
-        return self._tangents.at(state, stress)
+        return self._tangent.at(state, stress)
 
     def response(
         self, state: State, name: str, row: Row, *, exact: bool = False, anew: bool = False, counted: bool = True
@@ -187,16 +187,14 @@ class BorderedNewton:
         counted
             If not, the number of negative pivots means nothing.
         """
-        comm, near = self.system.comm, self._tangents.state
+        comm, near = self.system.comm, self._tangent.state
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         serves = moved <= self.options.fresh and not (exact or anew)
-        fresh = serves and (not counted or self._tangents.certain)
+        fresh = serves and (not counted or self._tangent.certain)
         matrix = self._bordered(near if fresh and near else state, name, row, rough=not anew, sure=counted)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
-        if (moved and fresh) or self._tangents.rough:
-            refined = refined_tangent(
-                self.system, matrix, tangent, state, load, row, foreseeing=self._tangents.foresees
-            )
+        if (moved and fresh) or self._tangent.rough:
+            refined = refined_tangent(self.system, matrix, tangent, state, load, row, foreseeing=self._tangent.foresees)
             if refined is None:
                 return self.response(state, name, row, anew=True)
             tangent = refined
@@ -207,9 +205,9 @@ class BorderedNewton:
     def _bordered(self, state: State, name: str, row: Row, *, rough: bool, sure: bool) -> Bordered:
         """The bordered matrix at a state; the one of the last solve if it has the same state and row."""
         last, count = self._linear.matrix, self.factorisation.count
-        factors = self._tangents.at(state, rough=rough, sure=sure)
+        factors = self._tangent.at(state, rough=rough, sure=sure)
         kept = count == factors.count and last and last.row is row and last.state is state  # the same object
-        return last if kept and last else Bordered(self.system, factors, state, name, row, rough=self._tangents.rough)
+        return last if kept and last else Bordered(self.system, factors, state, name, row, rough=self._tangent.rough)
 
 
 @dataclass

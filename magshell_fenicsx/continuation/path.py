@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,19 +19,15 @@ from magshell_fenicsx.continuation.point import (
     Progress,
     StepOptions,
 )
-from magshell_fenicsx.continuation.snes import FAR, HIDDEN
+from magshell_fenicsx.continuation.snes import FAR
+from magshell_fenicsx.continuation.stepping import LEAST_PART, LOOKED_BACK, Ahead, Course, Far, Plan
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
 Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
 Arrive = Callable[[float, Sequence[Point]], float]
-MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
 MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
 BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
-LOOKS = 2  # at a point that was found too far away; a third point before it means that it is on another branch
-LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
-SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
-LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
@@ -40,16 +36,6 @@ NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody cou
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
 ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
-
-
-@dataclass
-class _Far:
-    """A point that was found too far away, why it is no step, whether it has its own inertia, and the looks at it."""
-
-    point: Point
-    reason: str
-    exact: bool
-    looks: int = 0
 
 
 class NotANumber(RuntimeError):
@@ -73,8 +59,7 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        The part of the straight way from a point to a first guess at which forces set in: a step ends there. Whether it
-        is just behind. Zero if the guess loses forces of the point: then its tangent alone foresees the next one.
+        What happens to forces on the straight way from a point to a first guess.
     """
 
     def __init__(
@@ -86,7 +71,7 @@ class Path:
         scale: float = 1.0,
         journal: Journal | None = None,
         progress: Progress | None = None,
-        setting_in: Callable[[State, State], tuple[float, bool]] = lambda here, guess: (1.0, False),
+        setting_in: Callable[[State, State], Ahead] = lambda here, guess: Ahead(),
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
@@ -256,57 +241,56 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        o, passed, step, leaps, far, vain = self.options, [start], self.options.first, 0, None, None
+        course = Course([start], self.options.first)
         for target in targets:
-            while (here := passed[-1]).s != target:
-                way = target - here.s
-                pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
-                length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
-                length = min(length, self._past_fold(passed, length))
-                cubic, quintic = self._missed(passed)
-                smooth = quintic < cubic
-                if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
-                    length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
-                s = target if length == abs(way) else here.s + np.copysign(length, way)
-                s = arrive(s, seen := passed[-3:] if smooth else passed[-2:])
-                ahead = here is not vain
-                part, sets_in = self._setting_in(here.state, self.extended(s, seen)) if ahead else (1.0, False)
-                if not part:
-                    seen, part = passed[-1:], 1.0
-                s = here.s + part * (s - here.s) if part < 1 else s
-                tried = self._try(s, seen)
-                tried = self._reached(here, tried) if part < 1 and not sets_in else tried
-                if isinstance(tried, _Far):
-                    far, tried = tried, tried.reason
-                if isinstance(tried, str) and part < 1 and sets_in:
-                    vain, far = here, None
-                    continue
+            while (here := course.here).s != target:
+                plan = self._planned(course, target, arrive)
+                tried = self._tried(here, plan)
+                if isinstance(tried, Far):
+                    course.far, tried = tried, tried.reason
                 if isinstance(tried, str):
-                    leaps += 1
-                    over = tried == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
-                    step = 2 * length if over else length / 2
-                    if not step >= o.smallest:
-                        raise PathStopped(tried, here)
+                    course.failed(plan, tried, self.options.smallest)
                     continue
-                leaps, straight = 0, self._cosine(here, tried) > o.straight
-                if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
-                    step = min(max(step, min(step + length / 2, 2 * length)), o.largest)  # a target may have cut it
-                elif tried.factorisations >= o.hard and part == 1:
-                    step = 0.6 * length
-                before = [] if part < 1 or self._corner(here, tried) else passed[1 - LOOKED_BACK :]
-                passed, here = [*before, tried], tried
-                yield here, here.s == target
-                if not far:
-                    continue
-                again = self.measured_from(here, far.point)
-                length, far.looks = (again.s - here.s) * np.sign(way), far.looks + 1
-                solved = length > 0 and (far.exact or not again.turned_from(here))
-                if solved and not self._jumped(here, again := self.seen_from(here, again)):
-                    passed, step, far = [*passed[1 - LOOKED_BACK :], self.as_base(again)], length, None
-                    yield passed[-1], passed[-1].s == target
-                else:
-                    step = min(step, max(length / 2, LEAST_PART * step)) if length > 0 else step
-                    far = far if far.looks < LOOKS else None
+                straight, corner = self._cosine(here, tried) > self.options.straight, self._corner(here, tried)
+                course.reached(tried, plan, self.options, straight=straight, corner=corner)
+                yield tried, tried.s == target
+                if course.far and self._look_again(course, course.far, np.sign(target - here.s)):
+                    yield course.here, course.here.s == target
+
+    def _planned(self, course: Course, target: float, arrive: Arrive) -> Plan:
+        """The next step on the way to a target: it ends a little behind a fold, or where forces set in."""
+        passed, here, way = course.passed, course.here, target - course.here.s
+        length = course.length(way)
+        length = min(length, self._past_fold(passed, length))
+        cubic, quintic = self._missed(passed)
+        smooth = quintic < cubic
+        if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
+            length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
+        s = target if length == abs(way) else here.s + np.copysign(length, way)
+        seen, ahead = passed[-3:] if smooth else passed[-2:], Ahead()
+        s = arrive(s, seen)
+        if here is not course.vain:
+            ahead = self._setting_in(here.state, self.extended(s, seen))
+        if ahead.lets_go:  # others may meet on the way that its tangent foresees
+            seen = passed[-1:]
+            ahead = self._setting_in(here.state, self.extended(s, seen))
+        return Plan(here.s + ahead.part * (s - here.s) if ahead.part < 1 else s, seen, length, ahead)
+
+    def _tried(self, here: Point, plan: Plan) -> Point | Far | str:
+        """The next point, one that is too far away, or why there is none; see `_reached` before forces set in."""
+        tried = self._try(plan.s, plan.seen)
+        return self._reached(here, tried) if plan.ahead.part < 1 and not plan.ahead.behind else tried
+
+    def _look_again(self, course: Course, far: Far, sense: float) -> bool:
+        """Whether a point that was found too far away is a step from the last one; if so it is the last one now."""
+        here, again = course.here, self.measured_from(course.here, far.point)
+        length, far.looks = (again.s - here.s) * sense, far.looks + 1
+        solved = length > 0 and (far.exact or not again.turned_from(here))
+        if found := solved and not self._jumped(here, again := self.seen_from(here, again)):
+            course.reached_again(self.as_base(again), length)
+        else:
+            course.still_far(far, length)
+        return found
 
     def _past_fold(self, passed: Sequence[Point], length: float) -> float:
         """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
@@ -362,7 +346,7 @@ class Path:
             return point
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
 
-    def _try(self, s: float, passed: Sequence[Point]) -> Point | _Far | str:
+    def _try(self, s: float, passed: Sequence[Point]) -> Point | Far | str:
         """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
         here = passed[-1]
         self.progress.trying(here, s - here.s)
@@ -375,7 +359,7 @@ class Path:
         if turned := point.turned_from(here):
             point = self.exact(point, here)
         reason = self._jumped(here, point)
-        return _Far(point, reason, turned) if reason else self.as_base(point)
+        return Far(point, reason, turned) if reason else self.as_base(point)
 
     def _jumped(self, here: Point, there: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
@@ -393,11 +377,11 @@ class Path:
         gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
         return self._cosine(here, there) >= self.options.turn and gap <= max(self.options.gap * whole, SEEN)
 
-    def _reached(self, here: Point, there: Point | _Far | str) -> Point | _Far | str:
+    def _reached(self, here: Point, there: Point | Far | str) -> Point | Far | str:
         """A point before forces set in, unless they did, or there is a corner."""
         if not isinstance(there, Point):
             return there
-        clear = self._setting_in(here.state, there.state)[0] == 1.0
+        clear = self._setting_in(here.state, there.state).part == 1.0
         return there if clear and self._smooth(here, self.seen_from(here, there)) else TURNS
 
     def _corner(self, here: Point, there: Point) -> bool:

@@ -89,7 +89,7 @@ class NewtonOptions:
     kinks: bool = False
 
 
-class Tangents:
+class LatestTangent:
     """The factors of the latest tangent of a system, and the state to which they belong."""
 
     def __init__(self, system: System, factorisation: Factorisation) -> None:
@@ -159,8 +159,8 @@ class Linearised:
     It knows no SNES, which knows it: PETSc would keep both in memory for ever.
     """
 
-    def __init__(self, tangents: Tangents, options: NewtonOptions) -> None:
-        self._tangents, self._system, self._options = tangents, tangents.system, options
+    def __init__(self, tangent: LatestTangent, options: NewtonOptions) -> None:
+        self._tangent, self._system, self._options = tangent, tangent.system, options
         comm = self._system.comm
         self._last = comm.rank == comm.size - 1
         self.matrix: Bordered | None = None  # of the present solve, or of the last
@@ -310,10 +310,10 @@ class Linearised:
             if self._serves(size):
                 steps.append(Step(size, own=False))
                 return step
-        own = bool(steps) or not self._tangents.near(state, self._near)
+        own = bool(steps) or not self._tangent.near(state, self._near)
         anew = sum(step.own for step in steps) == OLD and not self.foreseeing
-        factors = self._tangents.at(state, self._stress, rough=not anew, sure=False) if own else self._tangents.latest
-        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangents.rough)
+        factors = self._tangent.at(state, self._stress, rough=not anew, sure=False) if own else self._tangent.latest
+        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangent.rough)
         self.matrix, step = matrix, matrix.solve(*f, rough=True)
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))

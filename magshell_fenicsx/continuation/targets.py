@@ -67,7 +67,10 @@ def _solved(path: Path, quantity: Quantity, target: float, around: Sequence[Poin
     s = _zero(missed, low.s, high.s)
     t = (s - low.s) / (high.s - low.s)
     stress = [(1 - t, low.state.u), (t, high.state.u)]
-    point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress, near=high.state)
+    # between different counts a target has its own; the step's end serves where it is close behind
+    counts = {(point.negative_pivots, point.negative_pivots_held) for point in (low, high)}
+    end = high.state if len(counts) == 1 and abs(high.s - s) < 2 * (BEHIND - 1) * abs(high.s - low.s) else None
+    point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress, near=end)
     if isinstance(point, str):
         raise PathStopped(point, low)
     return point

@@ -437,7 +437,9 @@ class Walk:
                 break
         if self._by_arc and self.goal.targets:
             until, targets = self.goal.until in ("target", "limit"), self.goal.targets
-            around = [*self.points[-2:-1], low, high]
-            for target, point in targets_between(self.path, self.goal.quantity, targets, self.goal.sense, around):
-                events.append(("target", point, until and target == targets[-1]))
+            seen = [*self.points[-2:-1], low]
+            for end in (*(self.path.as_base(event) for label, event, _ in events if label == "fold"), high):
+                seen = [*seen[-2:], end]  # a target just below a fold is passed on both sides of it
+                for target, point in targets_between(self.path, self.goal.quantity, targets, self.goal.sense, seen):
+                    events.append(("target", point, until and target == targets[-1]))
         return sorted(events, key=lambda item: abs(item[1].s - low.s))

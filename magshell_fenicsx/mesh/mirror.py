@@ -224,7 +224,7 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
     Raises
     ------
     MeshError
-        If triangles lie across a plane.
+        If triangles lie across a plane, or in it.
     """
     for name, plane in mirror.sides.items():
         patch = _halved(patch, plane, name)
@@ -234,9 +234,11 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
 def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     places = patch.embedding(patch.nodes)
     beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
-    kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
-    corners = beyond[patch.cells[kept, :3]]
-    if not kept.any() or (~kept).sum() == 0 or corners.min() < -ROUNDING * extent:
+    corners = beyond[patch.cells[:, :3]]
+    kept = corners.mean(axis=1) > 0
+    within = np.where(kept[:, None], corners, -corners)  # how far on their own side of the plane
+    across = within.min() < -ROUNDING * extent or within.max(axis=1).min() <= ROUNDING * extent
+    if kept.all() or not kept.any() or across:
         raise MeshError(
             f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"
         )

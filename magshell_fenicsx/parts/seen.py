@@ -88,7 +88,7 @@ class Slope:
 
 
 @dataclass(frozen=True)
-class Grid:
+class MapGrid:
     """A rectangle or a box in space with vectors at its points, in the frame of the case; lengths are over R.
 
     Attributes
@@ -182,7 +182,7 @@ class Seen:
         """Names of the grids in space on which it sees something."""
         return ()
 
-    def on_grids(self, sight: Sight, state: "State") -> Sequence[Grid]:
+    def on_grids(self, sight: Sight, state: "State") -> Sequence[MapGrid]:
         """These grids with what it sees there; collective."""
         return ()
 

@@ -24,15 +24,15 @@ PRELUDE = """#include <stdint.h>
 """  # of each file: FAST functions are compiled for several processors
 
 
-def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
-    """The cffi objects (ffi, lib) of a C file, compiled by rank 0 on first use. Collective.
+def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tuple[Any, Any]:
+    """The cffi objects (ffi, lib) of a C file, and what is `behind` it, compiled by rank 0 on first use. Collective.
 
     Raises
     ------
     RuntimeError
         On all ranks, if it cannot be compiled.
     """
-    text = PRELUDE + source.read_text(encoding="utf-8")
+    text = PRELUDE + "".join(each.read_text(encoding="utf-8") for each in (source, *behind))
     key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
     name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.stepping import Ahead
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.touching.touching import NEARER, Touching
 from magshell_fenicsx.simulate.scene import Scene
@@ -18,25 +19,25 @@ CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
 
 
-def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> tuple[float, bool]:
-    """The part of the straight way between two states of a step where shells meet that do not touch yet; collective.
+def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> Ahead:
+    """Where shells meet that do not touch yet, and whether all that touch let go; collective.
 
-    Just before, and `False`; or just behind, and `True`, where the first state is near enough. 1 if none meet; 0 if
-    those that touch at the first state let go.
+    Of pairs that meet on the straight way between two states of a step the first one counts. A step ends just behind
+    where it meets if the first state is near that, else just before.
     """
     touchings = [each for each in scene.model.touchings if isinstance(each, Touching)]  # not those on meridians
     if not touchings:
-        return 1.0, False
+        return Ahead()
     ends = leave(here), leave(guess)
     here_at, guess_at = map(scene.model.system.at, ends)
     u, v = (of_all_nodes(scene, state) for state in ends)
-    parts = list[tuple[float, bool]]()
+    meets, lets_go = (1.0, False), False
     for each in touchings:
         if here_at.of(each.penetration):
-            parts.append((float(guess_at.of(each.penetration) > 0), False))
+            lets_go |= not guess_at.of(each.penetration)
         else:
-            parts.append(_onset(each, each.pair.thickness * scene.problem.material.h, u, v))
-    return min(parts)
+            meets = min(meets, _onset(each, each.pair.thickness * scene.problem.material.h, u, v))
+    return Ahead(*meets, lets_go)
 
 
 def of_all_nodes(scene: Scene, state: State) -> Array:

@@ -25,7 +25,7 @@ from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0, rotation
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
@@ -70,16 +70,8 @@ def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
 
 def build_meridian_model(problem: Problem, *, assembled: bool = True) -> MeridianModel:
     """The meridian, whole on every rank; `assembled` as of the model."""
-    span = problem.meridian
-    assert span
-    named = {name: next(of for of, at in problem.points.items() if at is x) for name, x in problem.points.items()}
-    points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
-    pieces = [(piece.name, piece.ends) for piece in span.pieces]
-    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
-    vertices = meridian_vertices(problem)
-    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held)
     return MeridianModel(
-        meridian,
+        build_meridian(problem),
         problem.material,
         problem.mesh.degree,
         problem.conditions,
@@ -88,6 +80,18 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
         problem.thickness,
         assembled=assembled,
     )
+
+
+def build_meridian(problem: Problem) -> Meridian:
+    """Its mesh, on every rank."""
+    span = problem.meridian
+    assert span
+    named = {name: next(of for of, at in problem.points.items() if at is x) for name, x in problem.points.items()}
+    points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
+    pieces = [(piece.name, piece.ends) for piece in span.pieces]
+    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
+    vertices = meridian_vertices(problem)
+    return make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held)
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":

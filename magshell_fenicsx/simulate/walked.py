@@ -155,7 +155,11 @@ def _beyond(stage: Stage, walk: Walk, finest: float, *, final: bool) -> tuple[li
         return [], None if final else _onward(stage, walk)
     shortest = path.options.smallest
     last_resort = final or shortest <= finest
-    ahead = _fold_ahead(stage, walk, np.inf if last_resort else 2 * shortest)
+    within = abs(goal.targets[-1] - last.s)
+    if not last_resort:  # the step that failed ends at the next target, or before
+        ways = [(target - last.s) * np.sign(goal.targets[-1] - last.s) for target in goal.targets]
+        within = min(2 * shortest, *(way for way in ways if way > 0))
+    ahead = _fold_ahead(stage, walk, within)
     if ahead or last_resort:
         return ahead, None
     return [], _walk(stage, _asking(path, shortest, finest), last, goal)

@@ -55,10 +55,15 @@ def test_path_passes_the_snap_back_and_its_stability_is_told() -> None:
     assert backwards > 2
 
 
-def test_targets_are_met_on_every_part_of_the_path() -> None:
-    """q = 1 is passed once; load = 0.1 three times."""
-    loads = [p.state.u[1] for label, p in walked(Goal("points", [0.1], "load", steps=60)) if label == "target"]
-    assert np.sort(loads)[:3] == pytest.approx(np.sort(np.roots([1, -3, 2, -0.1]).real), abs=1e-9)
+@pytest.mark.parametrize("below", [0.2849, 1e-4, 1e-6])
+def test_targets_are_met_on_every_part_of_the_path(below: float) -> None:
+    """q = 1 is passed once; a load below the fold three times, twice in one step where it is just below."""
+    target = f(FOLDS[0]) - below
+    roots = np.sort(np.roots([1, -3, 2, -target]).real)
+    loads = [p.state.u[1] for label, p in walked(Goal("points", [target], "load", steps=60)) if label == "target"]
+    assert np.sort(loads)[:3] == pytest.approx(roots, abs=1e-9)
+    label, point = walked(Goal("target", [target], "load"))[-1]
+    assert (label, point.state.u[1]) == ("target", pytest.approx(roots[0], abs=1e-9))
 
 
 @pytest.mark.parametrize("largest", [0.2, 0.6])

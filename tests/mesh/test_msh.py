@@ -16,11 +16,13 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 from magshell_fenicsx.models.shell.patterns import ByPatch
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
+from magshell_fenicsx.shape.mirrors import mesh_mirrors
 from magshell_fenicsx.studies.points import parse_axis
 
 Script = Callable[[], None]
@@ -55,6 +57,18 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
     gmsh.option.setNumber("Mesh.MeshSizeMax", size)
     model.mesh.generate(2)
     model.mesh.setOrder(order)
+
+
+@pytest.mark.parametrize("cells", [[[0, 1, 3], [0, 3, 2], [1, 4, 3]], [[3, 2, 0], [3, 1, 4], [5, 6, 7]]])
+def test_no_mirror_through_triangles(cells: list[list[int]]) -> None:
+    """A triangle that is its own image, across the plane or in it, lies on neither side: it would be lost."""
+    web = [[0.0, 0, 1], [0, 1, 1], [0, 0.5, 2]]
+    nodes = np.array([[-1.0, 0, 0], [1, 0, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0], *web])
+    nodes = nodes[: np.max(cells) + 1]
+    patch = PatchMesh(nodes, np.array(cells), lambda x: x)
+    assert not mesh_mirrors(patch, [], loosely=True)
+    with pytest.raises(MeshError, match="no edges of the mesh lie in the plane"):
+        cut(patch, Mirror(np.array([1.0, 0, 0])))
 
 
 def test_a_check_tells_what_was_read() -> None:

@@ -91,3 +91,24 @@ def test_copies_make_the_half(name: str) -> None:
     forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)
     assert (forces[0] > 0) == (name == "rings")
+
+
+def test_a_ball_on_a_sector() -> None:
+    """A ball on the axis of a cap that has waves around it presses on the copies as on the half, 1e-9."""
+    cap = {"geometry": "cap", "radius": 1, "polar": 20, **MATERIAL}
+    ball = {"bodies": {"ball": {"kind": "sphere", "radius": 0.2}}, "loading": {"kind": "contact", "approach": 1}}
+    data = {"shell": cap, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3, "size": 0.15}, "symmetry": 3, **ball}
+    scene = Scene(Case.from_source(data))
+    model = scene.model
+    assert isinstance(model, ShellModel)
+    assert isinstance(model.excluded_modes, UnfoldedModes)
+    half, u = model.excluded_modes.half, symmetric(scene, -0.1)
+    copies = model.excluded_modes.unfolded(u)
+    mu = scene.unloaded().mu | {"approach": 0.5}
+    deep = [each.region(State(v, mu), "approach").penetration for each, v in ((model, u), (half, copies))]
+    assert deep[0] > 0.1 * h
+    assert deep[1] == pytest.approx(deep[0], rel=1e-9)
+    works = [model.system.residual(u, mu) @ u, half.system.residual(copies, mu) @ copies]
+    free = model.system.residual(u, mu | {"approach": 0.0}) @ u
+    assert works[1] == pytest.approx(3 * works[0], rel=1e-9)
+    assert abs(works[0] - free) > 1e-3 * abs(free)  # the ball is in it

@@ -132,4 +132,6 @@ def test_strip_bends_to_both_sides() -> None:
         assert 120000 * float(last["lambda_m"]) == pytest.approx(K**2, rel=1e-6)
         tips.append(float(last["w_pole_over_h"]) / 100)
     assert tips[0] == pytest.approx(0, abs=1e-6)
+    straight = [row for row in found.rows if row["branch"] == 0 and row["label"] != "bifurcation"]
+    assert [row["negative_pivots"] for row in straight] == [int(row["lambda_m"] > value) for row in straight]
     assert sorted(tips[1:]) == pytest.approx([-np.sqrt(2) / K, np.sqrt(2) / K], rel=1e-3)

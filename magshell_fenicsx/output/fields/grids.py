@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import arrays, content_of, give, give_texts, read_grid
-from magshell_fenicsx.parts.seen import Grid
+from magshell_fenicsx.parts.seen import MapGrid
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -18,7 +18,7 @@ QUAD, HEXAHEDRON = 9, 12  # VTK's numbers of cell types
 NAMED = ("name", "unit", "words")
 
 
-def grid_content(grid: Grid, R: float) -> bytes:
+def grid_content(grid: MapGrid, R: float) -> bytes:
     """The content of a .vtu file with B at a grid's points, which are over R; R is in metres, nan without units."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
@@ -42,7 +42,7 @@ def grid_content(grid: Grid, R: float) -> bytes:
     return content_of(made)
 
 
-def read_map(file: Path) -> tuple[Grid, float]:
+def read_map(file: Path) -> tuple[MapGrid, float]:
     """The grid of a file, and R in metres.
 
     Raises
@@ -51,13 +51,13 @@ def read_map(file: Path) -> tuple[Grid, float]:
         If it cannot be read.
     """
 
-    def made(read: "vtkUnstructuredGrid") -> tuple[Grid, float]:
+    def made(read: "vtkUnstructuredGrid") -> tuple[MapGrid, float]:
         numbers, texts = arrays(read.GetFieldData()), {name: _text(read.GetFieldData(), name) for name in NAMED}
         along = tuple(int(n) for n in numbers["points_along"].ravel())
         values = arrays(read.GetPointData())["B"].reshape(int(np.prod(along)), 3)
         corner, sides = numbers["corner"].reshape(3), numbers["sides"].reshape(-1, 3)
         R = float(numbers["R_in_m"].ravel()[0]) if "R_in_m" in numbers else nan
-        return Grid(texts["name"], corner, sides, along, texts["unit"], texts["words"], values), R
+        return MapGrid(texts["name"], corner, sides, along, texts["unit"], texts["words"], values), R
 
     return read_grid(file, made)
 

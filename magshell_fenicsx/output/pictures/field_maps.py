@@ -12,7 +12,7 @@ from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, columns,
 from magshell_fenicsx.output.pictures.readings import unit_of
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.pictures.view import tessellated
-from magshell_fenicsx.parts.seen import Grid
+from magshell_fenicsx.parts.seen import MapGrid
 from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -34,7 +34,7 @@ LINE_WIDTH, TINY = 0.6, 1e-300  # points: around the section of the shell, whose
 
 
 def field_maps_figure(
-    maps: Sequence[tuple[Grid, float]], surface: Surface, h: float, case: Mapping[str, Any], style: OutputSection
+    maps: Sequence[tuple[MapGrid, float]], surface: Surface, h: float, case: Mapping[str, Any], style: OutputSection
 ) -> "Figure":
     """Draw |B| in colours and the lines of the part in the plane; of a box the plane nearest to its middle.
 
@@ -66,7 +66,7 @@ def field_maps_figure(
     return figure
 
 
-def plane_of(grid: Grid) -> Grid:
+def plane_of(grid: MapGrid) -> MapGrid:
     """The grid itself; of a box the layer that is nearest to the middle of its third side."""
     if len(grid.points) == 2:
         return grid
@@ -74,10 +74,10 @@ def plane_of(grid: Grid) -> Grid:
     layer = nz // 2
     corner = grid.corner + layer / (nz - 1) * grid.sides[2]
     values = grid.values.reshape(nz, ny, nx, 3)[layer].reshape(-1, 3)
-    return Grid(grid.name, corner, grid.sides[:2], (nx, ny), grid.unit, grid.words, values)
+    return MapGrid(grid.name, corner, grid.sides[:2], (nx, ny), grid.unit, grid.words, values)
 
 
-def section(surface: Surface, grid: Grid) -> Array:
+def section(surface: Surface, grid: MapGrid) -> Array:
     """Where the deformed mid-surface, or the surface of a solid, meets the plane of a grid: lines (n, 2, 3), over R."""
     pieces = tessellated(surface)
     places = pieces.at(surface.r0 + surface.u)
@@ -97,7 +97,7 @@ def section(surface: Surface, grid: Grid) -> Array:
     return np.stack(ends, axis=1)
 
 
-def _draw(axes: "Axes", grid: Grid, R: float, surface: Surface, h: float, case: Mapping[str, Any]) -> None:
+def _draw(axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, case: Mapping[str, Any]) -> None:
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import PathPatch
@@ -186,7 +186,7 @@ def masked(values: Array) -> Any:
     return np.ma.masked_array(values, np.isnan(values))  # type: ignore[no-untyped-call]
 
 
-def _place(grid: Grid, units: Array, length: float, R: float) -> str:
+def _place(grid: MapGrid, units: Array, length: float, R: float) -> str:
     """Where a plane is, if it is one of x, y or z."""
     e = np.abs(np.cross(*units))
     number = int(e.argmax())

@@ -29,7 +29,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.output.store.written import note, refuse_unwritten
-from magshell_fenicsx.parts.seen import Grid
+from magshell_fenicsx.parts.seen import MapGrid
 
 MOST_PANELS = 12
 MAPS = "field_maps"  # key of the case with their names
@@ -81,7 +81,7 @@ class Drawn:
             self._points[number] = read_point(self.folder / "fields", number)
         return self._points[number]
 
-    def maps_at(self, row: Row) -> list[tuple[Grid, float]]:
+    def maps_at(self, row: Row) -> list[tuple[MapGrid, float]]:
         """The grids beside the shell at a point, and R in metres."""
         files = (self.folder / "fields" / grid_file(name, int(row["point"])) for name in self.resolved.get(MAPS) or ())
         return [read_map(file) for file in files]

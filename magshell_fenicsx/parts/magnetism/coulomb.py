@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism.by_charges import Weights, add
 from magshell_fenicsx.parts.magnetism.charged import STEP, Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.close import Close
 from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
@@ -35,6 +36,7 @@ PRECISION = 1e-5  # of a pair of cells at their distance
 BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
 FLAT = 0.3  # sine of the angle up to which a cell is beside another: the pole is then beyond the ellipse's end
+ROUNDED = 9  # digits in which areas of parts are compared
 SPACE = 1e-3  # of cells that touch, over their size
 
 
@@ -58,6 +60,7 @@ class Kind:
         self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None, *, may: bool = False
     ) -> None:
         self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
+        self.faces = edge is None
         self.family = Faces(shape, cells, may=may) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
         count = len(copies.images)
         self.cells = np.concatenate([cells + copy * len(shape.r0) for copy in range(count)])
@@ -159,19 +162,28 @@ class Charged:
         kinds += [Kind(shape, cells[edges == edge], copies, edge) for edge in range(3) if (edges == edge).any()]
         sizes = [kind.charged(0) for kind in kinds]
         self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if may or size > NOTHING * max(sizes)]
-        self._apart = np.array(parts[:, None] != parts, dtype=np.uint8)
+        self._others = np.asarray(parts[:, None] != parts)  # pairs of different parts
+        self._apart = self._others.astype(np.uint8)
         for cell, others in enumerate(near.touching if near else ()):
             self._apart[cell] = 1
             self._apart[cell, others] = 0
         self._parts = parts
+        assert isinstance(kinds[0].family, Faces)
+        sizes_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), len(copies.images)))
+        number = np.tile(np.arange(len(shape.r0)), len(copies.images))
+        order = np.empty(len(parts), dtype=np.intp)
+        order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(ROUNDED)])] = np.arange(len(parts))
+        self._close = Close(shape, kinds[0].family, copies, order, comm)
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))
         self._grid: Grid | None = None
         self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
 
-    def rules(self, nodes: Array, own: range) -> NDArray[np.int8]:
+    def rules(self, nodes: Array, own: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
         """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that has none here.
+
+        And the pairs whose faces are close: they have a rule of their own.
 
         Raises
         ------
@@ -180,10 +192,13 @@ class Charged:
         """
         least, worst = np.array([rate(each) for each in DEGREES]), rate(BEYOND)
         apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
+        close = self._close.of(nodes, own, apart & self._others[own.start : own.stop])
+        apart &= ~close
         rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
         if rules is None:
             raise Touching
-        return rules
+        rules[close] = len(DEGREES) - 1
+        return rules, close
 
     def boxes(self, nodes: Array, own: range) -> tuple[Far, NDArray[np.bool_]]:
         """Cells far from each other by boxes, and the pairs (own, copies * cells) that are too near for that.
@@ -215,7 +230,7 @@ class Charged:
         Touching
             See `rules`.
         """
-        rules, gradient = self.rules(nodes, own), np.zeros_like(nodes)
+        (rules, close), gradient = self.rules(nodes, own), np.zeros_like(nodes)
         far = self.boxes(nodes, own)[0]
         energy = far.add(far.placed(nodes), bent=stiffness is not None)
         first, second = np.nonzero(rules >= 0)
@@ -228,6 +243,8 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
                 charged = (one_row >= 0) & (other_row >= 0)
+                if one.faces and other.faces:
+                    charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
                 left, right = (one.rule(int(number)), one_row[charged]), (other.rule(int(number)), other_row[charged])
                 count = int(charged.sum())
                 energy += share * self._pairs.add(nodes, cells[charged], count, left, right, gradient, stiffness)
@@ -235,6 +252,10 @@ class Charged:
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:
             energy += self._near.add(nodes, gradient, stiffness)
+        if close.any() and self._kinds[0].faces:
+            energy += self._close.add(nodes, own, close, gradient, stiffness)
+            if np.isnan(energy):
+                raise Touching
         if stiffness:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
@@ -250,7 +271,7 @@ class Charged:
         Touching
             See `rules`.
         """
-        rules, moved = self.rules(nodes, own), nodes + STEP * 1j * rates
+        (rules, close), moved = self.rules(nodes, own), nodes + STEP * 1j * rates
         into = self._shape.nothing(of_shape=of_shape)
         far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
         on_far = far.by_charges(nodes, moved, cells_far, weights, heights=of_shape)
@@ -265,13 +286,22 @@ class Charged:
             for one, other in product(self._kinds, self._kinds):
                 one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
                 charged = (one_row >= 0) & (other_row >= 0)
+                if one.faces and other.faces:
+                    charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
                 left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
                 one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
                 if of_shape:
                     one.back_of_heights(number, add(moved, cells[charged], left, right, weights, heights=True)[0], into)
         if self._near:
             self._near.by_fields(moved, weights, into)
+        if close.any() and self._kinds[0].faces:
+            self._close.by_fields(nodes, own, close, moved, weights, into)
         return into
+
+
+def _areas(r0: Array) -> Array:
+    """(cells,) of flat triangles."""
+    return np.asarray(np.linalg.norm(np.cross(r0[:, 1] - r0[:, 0], r0[:, 2] - r0[:, 0]), axis=-1) / 2)
 
 
 def _balls(nodes: Array) -> tuple[Array, Array]:

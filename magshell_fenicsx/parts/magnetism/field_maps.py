@@ -14,7 +14,7 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_reading, refuse_unknown_field, units
 from magshell_fenicsx.parts.part import Context, KeyAbility
-from magshell_fenicsx.parts.seen import Grid, Seen, Sight
+from magshell_fenicsx.parts.seen import MapGrid, Seen, Sight
 from magshell_fenicsx.shape.ground import Coordinates
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class FieldMap:
         See `sensors.Sensor`.
     """
 
-    grid: Grid
+    grid: MapGrid
     places: Array
     total: bool
     own: float
@@ -92,7 +92,7 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
     own, R = units(context), context.shell.reference
     unit = unit_of_readings(context)
     grids = [
-        (each, Grid(name, np.array(each.corner) / R, np.array(each.sides) / R, tuple(each.points), unit, each.field))
+        (each, MapGrid(name, np.array(each.corner) / R, np.array(each.sides) / R, tuple(each.points), unit, each.field))
         for name, each in given.items()
     ]
     return tuple(FieldMap(grid, grid.places @ rotation(turn).T, each.field == "total", *own) for each, grid in grids)
@@ -140,7 +140,7 @@ class FieldMapsSeen(Seen):
     def grids(self, loads: "Loads") -> Sequence[str]:
         return [each.grid.name for each in loads.field_maps]
 
-    def on_grids(self, sight: Sight, state: "State") -> list[Grid]:
+    def on_grids(self, sight: Sight, state: "State") -> list[MapGrid]:
         from magshell_fenicsx.parts.magnetism.readings import field_at  # the solver takes long to import
 
         return [

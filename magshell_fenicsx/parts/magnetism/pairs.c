@@ -38,7 +38,7 @@ INLINE void cross(const v *a, const v *b, v *c)
 }
 
 /* T (3, k): shape functions and their derivatives; nodes (k, 3). Second derivatives are set to zero if `bent`. */
-INLINE void place(int k, const double *T, const v *nodes, int bent, Point *p)
+INLINE void place(int k, const v *T, const v *nodes, int bent, Point *p)
 {
     v a[3][3];
     memset(a, 0, sizeof a);
@@ -68,7 +68,7 @@ INLINE void times(const v *K, const v *x, v *y)
 }
 
 /* Add what a point's own derivatives are by the nodes of its cell: gradient (k, 3), and unless NULL H (a <= b, 3, 3). */
-INLINE void own(int k, const double *T, const Point *p, v *gradient, v *H)
+INLINE void own(int k, const v *T, const Point *p, v *gradient, v *H)
 {
     const v *n = p->n;
     v c[2][3];
@@ -114,6 +114,13 @@ INLINE void gather(const double *x, int64_t step, const int64_t *at, v *y)
 {
     for (int c = 0; c < LANES; ++c)
         (*y)[c] = x[step * at[c]];
+}
+
+/* n numbers, the same in all lanes. */
+INLINE void spread(int n, const double *x, v *y)
+{
+    for (int i = 0; i < n; ++i)
+        y[i] = x[i] + (v){0.0};
 }
 
 /* The energy of the charges q (L,) at one point and p (S,) at another, at heights hL and hR over the thickness. The
@@ -172,6 +179,63 @@ INLINE void between(int64_t L, int64_t S, int bent, Point *left, const v *q, con
         left->K[0][i] += X[i], right->K[0][i] += X[i], right->K[1][i] += X[12 + i];
 }
 
+/* Add to A and B (9 k,) what X of `between` is by the nodes of the right cell, T (3, k). */
+INLINE void mixed(int k, const v *T, const Point *right, const v *X, v *A, v *B)
+{
+    v a[2][3], b[2][3];
+    for (int e = 0; e < 2; ++e)
+        times(X + 12, right->up[e], a[e]), times(X + 18, right->up[e], b[e]);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            const v n = right->n[j], a0 = X[AT[i][j]], a1 = a[0][i] * n, a2 = a[1][i] * n;
+            const v b0 = X[6 + AT[i][j]], b1 = b[0][i] * n, b2 = b[1][i] * n;
+            v *one = A + (3 * i + j) * k, *other = B + (3 * i + j) * k;
+            for (int l = 0; l < k; ++l) {
+                one[l] += a0 * T[l] - a1 * T[k + l] - a2 * T[2 * k + l];
+                other[l] += b0 * T[l] - b1 * T[k + l] - b2 * T[2 * k + l];
+            }
+        }
+}
+
+/* Add to HX (3 k, 3 k) what A and B are by the nodes of the left cell. */
+INLINE void mix(int k, const v *T, const Point *left, const v *A, const v *B, v *HX)
+{
+    v C[2][3 * k];
+    for (int e = 0; e < 2; ++e)
+        for (int l = 0; l < 3 * k; ++l)
+            C[e][l] = left->up[e][0] * B[l] + left->up[e][1] * B[3 * k + l] + left->up[e][2] * B[6 * k + l];
+    for (int l = 0; l < k; ++l)
+        for (int m = 0; m < 3 * k; ++m) {
+            const v turned = T[k + l] * C[0][m] + T[2 * k + l] * C[1][m];
+            for (int i = 0; i < 3; ++i)
+                HX[(3 * l + i) * 3 * k + m] += left->n[i] * turned - T[l] * A[3 * i * k + m];
+        }
+}
+
+/* Add the second derivatives H (k, 3, 3, k) by the nodes of two cells to blocks; see `pairs`. */
+INLINE void put(int k, const double *H, int64_t one, int64_t other, double *blocks, const int32_t *where,
+                int64_t columns, const int64_t *row_of, const int64_t *column_of, const double *first,
+                const double *second)
+{
+    for (int l = 0; l < k; ++l)
+        for (int m = 0; m < k; ++m) {
+            const int64_t a = row_of[k * one + l], b = row_of[k * other + m];
+            const int64_t i0 = column_of[k * one + l], j0 = column_of[k * other + m];
+            double h[3][3];
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j)
+                    h[i][j] = H[(3 * l + i) * 3 * k + j * k + m];
+            for (int i = 0; i < 3 && a >= 0; ++i)
+                for (int j = 0; j < 3; ++j)
+                    blocks[9 * where[a * columns + j0] + 3 * i + j] +=
+                        h[i][0] * second[j] + h[i][1] * second[3 + j] + h[i][2] * second[6 + j];
+            for (int j = 0; j < 3 && b >= 0; ++j)
+                for (int i = 0; i < 3; ++i)
+                    blocks[9 * where[b * columns + i0] + 3 * j + i] +=
+                        h[0][j] * first[i] + h[1][j] * first[3 + i] + h[2][j] * first[6 + i];
+        }
+}
+
 /* Add the derivatives of a point of LANES elements to the sums of those (.., SUMS), `step` apart; `idle` ones are left out. */
 INLINE void sum_up(const Point *p, int bent, int64_t idle, const int64_t *at, int64_t step, double *sums)
 {
@@ -201,8 +265,8 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
     const int64_t all = same ? M : P * M;
     double energy = 0.0;
     Point points[same ? M : 1];
-    v QR[same ? M * S : S], XL[3 * k], XR[3 * k], GR[3 * k], A[9 * k], B[9 * k], C[2][3 * k];
-    v HR[bent && !same ? half : 1], HX[bent ? 9 * k * k : 1];
+    v QR[same ? M * S : S], XL[3 * k], XR[3 * k], GR[3 * k], A[9 * k], B[9 * k];
+    v T[3 * k], first[3 * k], HR[bent && !same ? half : 1], HX[bent ? 9 * k * k : 1];
     for (int64_t at = 0; at < count; at += LANES) {
         v sum, live, q[L];
         memset(&sum, 0, sizeof sum), memset(GR, 0, sizeof GR);
@@ -217,14 +281,16 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
             gather(nodes + l, 3 * k, left_cell, XL + l), gather(nodes + l, 3 * k, right_cell, XR + l);
         if (same)
             for (int64_t m = 0; m < M; ++m) {
-                place(k, TR + m * 3 * k, XR, bent, points + m);
+                spread(3 * k, TR + m * 3 * k, T);
+                place(k, T, XR, bent, points + m);
                 gather(tR + m, M, eR + at, &points[m].t);
                 for (int64_t s = 0; s < S; ++s)
                     gather(qR + m * S + s, M * S, eR + at, QR + m * S + s);
             }
         for (int64_t p = 0; p < P; ++p) {
             Point left;
-            place(k, TL + p * 3 * k, XL, bent, &left);
+            spread(3 * k, TL + p * 3 * k, first);
+            place(k, first, XL, bent, &left);
             gather(tL + p, P, eL + at, &left.t);
             for (int64_t l = 0; l < L; ++l) {
                 gather(qL + p * L + l, P * L, eL + at, q + l);
@@ -236,7 +302,9 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                 const int64_t row = same ? m : p * M + m;
                 Point *right = same ? points + m : points;
                 v *charges = same ? QR + m * S : QR, X[24];
-                const double *T = TR + row * 3 * k, *from = hL + p * L, *to = hR + row * S;
+                const double *from = hL + p * L, *to = hR + row * S;
+                if (!same || bent)
+                    spread(3 * k, TR + row * 3 * k, T);
                 if (!same) {
                     place(k, T, XR, bent, right);
                     gather(tR + row, all, eR + at, &right->t);
@@ -253,33 +321,12 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
                     own(k, T, right, GR, bent ? HR : 0);
                 if (!bent)
                     continue;
-                v a[2][3], b[2][3];
-                for (int e = 0; e < 2; ++e)
-                    times(X + 12, right->up[e], a[e]), times(X + 18, right->up[e], b[e]);
-                for (int i = 0; i < 3; ++i)
-                    for (int j = 0; j < 3; ++j) {
-                        const v n = right->n[j], a0 = X[AT[i][j]], a1 = a[0][i] * n, a2 = a[1][i] * n;
-                        const v b0 = X[6 + AT[i][j]], b1 = b[0][i] * n, b2 = b[1][i] * n;
-                        v *one = A + (3 * i + j) * k, *other = B + (3 * i + j) * k;
-                        for (int l = 0; l < k; ++l) {
-                            one[l] += a0 * T[l] - a1 * T[k + l] - a2 * T[2 * k + l];
-                            other[l] += b0 * T[l] - b1 * T[k + l] - b2 * T[2 * k + l];
-                        }
-                    }
+                mixed(k, T, right, X, A, B);
             }
             sum_up(&left, bent, none, eL + at, P * SUMS, sL + p * SUMS);
             if (!bent)
                 continue;
-            const double *T = TL + p * 3 * k;
-            for (int e = 0; e < 2; ++e)
-                for (int l = 0; l < 3 * k; ++l)
-                    C[e][l] = left.up[e][0] * B[l] + left.up[e][1] * B[3 * k + l] + left.up[e][2] * B[6 * k + l];
-            for (int l = 0; l < k; ++l)
-                for (int m = 0; m < 3 * k; ++m) {
-                    const v turned = T[k + l] * C[0][m] + T[2 * k + l] * C[1][m];
-                    for (int i = 0; i < 3; ++i)
-                        HX[(3 * l + i) * 3 * k + m] += left.n[i] * turned - T[l] * A[3 * i * k + m];
-                }
+            mix(k, first, &left, A, B, HX);
         }
         for (int64_t m = 0; m < M && same; ++m)
             sum_up(points + m, bent, none, eR + at, M * SUMS, sR + m * SUMS);
@@ -293,24 +340,12 @@ FAST double pairs(int64_t count, int64_t counted, int64_t idle, const int64_t *b
             to = onto + half * right_cell[c];
             for (int l = 0; l < half && !same; ++l)
                 to[l] += HR[l][c];
-            const double *first = turn + 9 * (left_cell[c] / modelled), *second = turn + 9 * (right_cell[c] / modelled);
-            for (int l = 0; l < k; ++l)
-                for (int m = 0; m < k; ++m) {
-                    const int64_t a = row_of[k * left_cell[c] + l], b = row_of[k * right_cell[c] + m];
-                    const int64_t i0 = column_of[k * left_cell[c] + l], j0 = column_of[k * right_cell[c] + m];
-                    double h[3][3];
-                    for (int i = 0; i < 3; ++i)
-                        for (int j = 0; j < 3; ++j)
-                            h[i][j] = factor * HX[(3 * l + i) * 3 * k + j * k + m][c];
-                    for (int i = 0; i < 3 && a >= 0; ++i)
-                        for (int j = 0; j < 3; ++j)
-                            blocks[9 * where[a * columns + j0] + 3 * i + j] +=
-                                h[i][0] * second[j] + h[i][1] * second[3 + j] + h[i][2] * second[6 + j];
-                    for (int j = 0; j < 3 && b >= 0; ++j)
-                        for (int i = 0; i < 3; ++i)
-                            blocks[9 * where[b * columns + i0] + 3 * j + i] +=
-                                h[0][j] * first[i] + h[1][j] * first[3 + i] + h[2][j] * first[6 + i];
-                }
+            double cross_block[9 * k * k];
+            for (int l = 0; l < 9 * k * k; ++l)
+                cross_block[l] = factor * HX[l][c];
+            const int64_t one = left_cell[c], other = right_cell[c];
+            put(k, cross_block, one, other, blocks, where, columns, row_of, column_of, turn + 9 * (one / modelled),
+                turn + 9 * (other / modelled));
         }
     }
     return energy;
@@ -333,11 +368,13 @@ FAST void points(int64_t count, int64_t idle, const int64_t *cells, int64_t node
         memset(G, 0, sizeof G), memset(H, 0, sizeof H);
         for (int64_t p = 0; p < P; ++p) {
             Point point;
-            place(k, T + p * 3 * k, X, onto != 0, &point);
+            v each_of[3 * k];
+            spread(3 * k, T + p * 3 * k, each_of);
+            place(k, each_of, X, onto != 0, &point);
             v *each = point.F;
             for (int i = 0; i < (onto ? SUMS : 6); ++i)
                 gather(sums + p * SUMS + i, P * SUMS, of, each + i);
-            own(k, T + p * 3 * k, &point, G, onto ? H : 0);
+            own(k, each_of, &point, G, onto ? H : 0);
         }
         for (int c = 0; c < LANES - none; ++c) {
             for (int l = 0; l < 3 * k; ++l)

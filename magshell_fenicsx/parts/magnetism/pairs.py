@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from mpi4py import MPI
@@ -27,8 +28,14 @@ FUNCTIONS = """
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
         int64_t, const double *, const double *, double *);
+    typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S; const double *charges, *thickness,
+        *heights; int64_t P; const double *T, *X, *weights, *gauss; double h, least, inside, precision; } Cells;
+    double close_pairs(const Cells *, int64_t, const int64_t *, const double *, double *, double, double *, double *,
+        const int32_t *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
+    int64_t seen_of(const Cells *, int64_t, int64_t, const double *, int64_t, int64_t *, double *, double *, double *);
 """
 INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
+KEPT: WeakKeyDictionary[Any, dict[str, Array]] = WeakKeyDictionary()
 KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
 
 
@@ -153,7 +160,8 @@ class Pairs:
     """The sums over pairs of cells with nodes (cells, k, 3)."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        self._ffi, self._lib = native(Path(__file__).with_name("pairs.c"), FUNCTIONS, comm)
+        source, behind = (Path(__file__).with_name(name) for name in ("pairs.c", "close.c"))
+        self._ffi, self._lib = native(source, FUNCTIONS, comm, behind)
 
     def add(
         self,
@@ -180,18 +188,50 @@ class Pairs:
         both, left_rows, right_rows = (_filled(rows, idle) for rows in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        matrix = [*3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
-        if stiffness:
-            onto, blocks, where = stiffness.onto, stiffness.blocks, stiffness.where
-            turn, modelled = stiffness.turn, len(nodes) // len(stiffness.turn)
-            nodes_of = p(stiffness.row_of), p(stiffness.column_of)
-            matrix = [p(onto), p(blocks), p(where), where.shape[1], *nodes_of, p(turn), modelled]
         on_left, on_right = ([p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0]))
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
-        factor = stiffness.factor if stiffness else 0.0
         sums = p(right[0].sums) if same else self._ffi.NULL
         points = [P, L, *on_left, p(left[0].sums), p(left_rows), M, S, *on_right, sums, p(right_rows), int(same)]
-        return float(self._lib.pairs(*sizes, *points, p(gradient), factor, *matrix))
+        return float(self._lib.pairs(*sizes, *points, p(gradient), *self._matrix(nodes, stiffness)))
+
+    def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
+        if not stiffness:
+            return [0.0, *3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
+        p, where = self._pointer, stiffness.where
+        onto, blocks = p(stiffness.onto), p(stiffness.blocks)
+        nodes_of = p(stiffness.row_of), p(stiffness.column_of)
+        turn, modelled = p(stiffness.turn), len(nodes) // len(stiffness.turn)
+        return [stiffness.factor, onto, blocks, p(where), where.shape[1], *nodes_of, turn, modelled]
+
+    def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
+        """What `add_close` and `seen` have of all pairs: see `Cells` in close.c."""
+        made = self._ffi.new("Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()})
+        KEPT[made] = arrays  # as long as what points at them
+        return made
+
+    def add_close(
+        self, of: Any, nodes: Array, cells: Ints, gradient: Array, stiffness: Stiffness | None = None
+    ) -> float:
+        """The energy of pairs (n, 2) of cells that are close, as `add`; no number if two are in each other."""
+        p, pairs = self._pointer, np.ascontiguousarray(cells)
+        matrix = self._matrix(nodes, stiffness)
+        return (
+            float(self._lib.close_pairs(of, len(pairs), p(pairs), p(nodes), p(gradient), *matrix))
+            if len(cells)
+            else 0.0
+        )
+
+    def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array] | None:
+        """What P points of a cell see of another: places (P, M, 2), weights (P, M), and how far each is shifted (P,).
+
+        None if both are in each other.
+        """
+        p, count, shift = self._pointer, np.zeros(of.P, dtype=np.int64), np.zeros(of.P)
+        X, w = np.full((of.P, most, 2), 1 / 3), np.zeros((of.P, most))
+        if self._lib.seen_of(of, one, other, p(nodes), most, p(count), p(X), p(w), p(shift)):
+            return None
+        longest = count.max()
+        return X[:, :longest], w[:, :longest], shift
 
     def finish(
         self, nodes: Array, cells: Ints, points: "Points", gradient: Array, stiffness: Stiffness | None = None

@@ -242,3 +242,21 @@ def test_two_caps_are_one_on_a_plane() -> None:
     two, seen = end({"shells": shells, "contact": [["upper", "lower"]], "loading": load})
     assert two.model.axisymmetric
     assert seen["contact_force"] * two.model.force_unit == pytest.approx(one["reaction"] / h, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_wave_that_comes_and_goes_in_contact() -> None:
+    """Pressed domes tilt (m = 1) in a window with a point of the path, where 100 loads find it on this mesh."""
+    dome = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.015, "poisson_ratio": 0.3}
+    lower, upper = ({"shell": dome | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (3, 1))
+    upper["place"] = {"position": [0, 0, 1.5 * 0.015]}
+    load = {"kind": "dead", "control": "arc", "until": "target", "displacement": 5.5 * 0.015, "points": 1}
+    data = {
+        "shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "mesh": {"refinement": 0.5},
+        "loading": load | {"loads": [{"edge": "upper.hole", "force": [0, 0, -1]}]},
+    }  # fmt: skip
+    scene = Scene(Case.from_source(data))
+    found = [(r.mode, scene.observe(r.point.state)) for r in follow(scene) if r.label == "bifurcation"]
+    assert [mode for mode, _ in found] == ["m = 1", "m = 1"]
+    assert [seen["w_over_h"] for _, seen in found] == pytest.approx([5.1391, 5.4461], abs=1e-3)
+    assert [seen["contact_force"] for _, seen in found] == pytest.approx([6.7579, 7.0356], abs=1e-3)

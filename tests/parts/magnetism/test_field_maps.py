@@ -22,7 +22,7 @@ from magshell_fenicsx.output.fields.vtu import FieldSeries
 from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, outlines, plane_of, section, with_holes
 from magshell_fenicsx.output.pictures.plot import Drawn, plot
 from magshell_fenicsx.parts.registered import SEEN
-from magshell_fenicsx.parts.seen import Grid
+from magshell_fenicsx.parts.seen import MapGrid
 
 MM = 1e-3
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa",
@@ -47,7 +47,7 @@ def case(magnetic: dict[str, Any] | None = None, symmetry: str = "auto", **secti
 @pytest.mark.parametrize(("symmetry", "magnetic"), [("auto", POLAR), ("half", TILTED), ("none", TILTED)])
 def test_a_map_is_many_sensors(symmetry: str, magnetic: dict[str, Any]) -> None:
     """On each model the values are those of sensors there and of magpylib's charged triangles; nan in the material."""
-    at = Grid("box", MM * np.array([-12.0, 1, 8]), MM * np.diag([24.0, 8, 9]), (3, 2, 2), "T", "total").places
+    at = MapGrid("box", MM * np.array([-12.0, 1, 8]), MM * np.diag([24.0, 8, 9]), (3, 2, 2), "T", "total").places
     sensors = {f"s{i}": {"position": x.tolist(), "field": "total"} for i, x in enumerate(at)}
     given = case(magnetic, symmetry, sensors=sensors, field_maps={"box": BOX, "across": ACROSS, "below": BELOW})
     here = Scene(Case.from_source(given).problem())
@@ -84,7 +84,7 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     plane = plane_of(box)
     np.testing.assert_array_equal(plane.values, box.values[6:])
     surface, about = run.at(run.rows[0])
-    level = Grid("level", np.array([-1.0, -1.0, 0.9]), 2 * np.eye(3)[:2], (2, 2), "T", "own")
+    level = MapGrid("level", np.array([-1.0, -1.0, 0.9]), 2 * np.eye(3)[:2], (2, 2), "T", "own")
     lines = section(surface, level)
     np.testing.assert_allclose(np.linalg.norm(lines[..., :2], axis=-1), np.sqrt(1 - 0.81), atol=5e-3)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * np.pi * 0.19**0.5, rel=5e-3)
@@ -102,7 +102,7 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
 
 
 def test_a_file_gives_back_its_grid(tmp_path: Path) -> None:
-    grid = Grid("g", np.zeros(3), np.diag([1.0, 2.0, 3.0])[:2], (3, 2), "|Br|", "own", np.arange(18.0).reshape(6, 3))
+    grid = MapGrid("g", np.zeros(3), np.diag([1.0, 2.0, 3.0])[:2], (3, 2), "|Br|", "own", np.arange(18.0).reshape(6, 3))
     (tmp_path / "g.vtu").write_bytes(grid_content(grid, float("nan")))
     again, R = read_map(tmp_path / "g.vtu")
     assert np.isnan(R)

@@ -23,6 +23,7 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism import interacting
+from magshell_fenicsx.parts.magnetism.by_charges import Weights
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.public import run
@@ -61,10 +62,16 @@ def discs(file: Path, radius: float, apart: float, size: float) -> None:
     meshed(file, size, 2)
 
 
-def strips(file: Path, length: float, width: float, apart: float, size: float) -> None:
-    """Two parallel strips along x (mm)."""
+def strips(file: Path, length: float, width: float, apart: float, size: float, *, halved: bool = False) -> None:
+    """Two parallel strips along x (mm); if `halved`, with edges of cells along their middle."""
     for z in (0.0, apart):
         gmsh.model.occ.addRectangle(0, -width / 2, z, length, width)
+    if halved:
+        gmsh.model.occ.synchronize()
+        for _, line in gmsh.model.getEntities(1):
+            gmsh.model.mesh.setTransfiniteCurve(line, 3)
+        for _, face in gmsh.model.getEntities(2):
+            gmsh.model.mesh.setTransfiniteSurface(face)
     meshed(file, size)
 
 
@@ -116,10 +123,11 @@ def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, siz
     assert found == pytest.approx([0, 0, exact], rel=1e-3, abs=1e-3 * abs(exact))
 
 
-@pytest.mark.parametrize("gap", [1, 4, 20])
-@pytest.mark.parametrize("along", ["x", "z"])
+@pytest.mark.parametrize(
+    ("along", "gap"), [*((along, gap) for along in "xz" for gap in (1, 4, 20)), ("z", 0.2), ("z", 0.05)]
+)
 def test_force_between_parallel_strips(model: Any, tmp_path: Path, gap: float, along: str) -> None:
-    """Magpylib's cuboid on the charged sides of the other, at gaps of 1, 4 and 20 h: 1e-3."""
+    """Magpylib's cuboid on the charged sides of the other, and close above it: 1e-3."""
     h, L, w = 0.25, 5.0, 1.0
     strips(tmp_path / "strips.msh", L, w, (gap + 1) * h, 0.5)
     polar = {"x": 90, "z": 0}[along]
@@ -127,7 +135,7 @@ def test_force_between_parallel_strips(model: Any, tmp_path: Path, gap: float, a
     axis = np.eye(3)["xyz".index(along)]
     size = np.array([L, w, h]) * MM
     magnet = magpylib.magnet.Cuboid(polarization=BR * axis, dimension=size, position=(L * MM / 2, 0, 0))
-    x, weight = np.polynomial.legendre.leggauss(40)
+    x, weight = np.polynomial.legendre.leggauss(40 if gap >= 1 else 200)
     x = np.sin(np.pi / 2 * x)  # points gather at the edges
     weight = weight * np.pi / 2 * np.sqrt(1 - x**2)
     across = [i for i in range(3) if not axis[i]]
@@ -299,8 +307,8 @@ def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
 
 
 def test_parts_that_are_near_from_the_start(model: Any, tmp_path: Path) -> None:
-    """Their energy were no number: refused before anything is written, with what to do."""
-    strips(tmp_path / "near.msh", 4.0, 1.0, 0.3, 2.0)
+    """In each other, their energy were no number: refused before anything is written, with what to do."""
+    strips(tmp_path / "near.msh", 4.0, 1.0, 0.04, 2.0)
     with pytest.raises(CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"):
         Scene(case_of(tmp_path / "near.msh", 0.1))
 
@@ -409,7 +417,7 @@ def test_derivatives_by_thickness_and_place(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interaction: str, symmetry: str
 ) -> None:
     """Of the energy and of forces along a displacement: differences of fourth order, 1e-7; cells and rules stay."""
-    strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, 1.5)
+    strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, 1.5, halved=symmetry == "half")
     remanent = {"kind": "expression", "components": ["1 + x/9", "0", "0.2"], "flux_density": f"{BR} T"}
     case = case_of(
         tmp_path / "strips.msh",
@@ -521,3 +529,17 @@ def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) ->
     x, y, z = np.moveaxis(by.places, -1, 0)
     tips = [ran(side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
     assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
+
+
+def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
+    """Energy and forces are quadratic in it: Euler's identity, 1e-9."""
+    strips(tmp_path / "strips.msh", 4.0, 2.0, 0.33, 1.5)
+    scene = Scene(case_of(tmp_path / "strips.msh", 0.3, mesh={"degree": 2}))
+    (term,) = (each for each in scene.model.system.terms if each.name == "interaction")
+    nodes, own, charged = term._nodes(), term._cells.own, term._charged
+    assert charged.rules(nodes, own)[1].any()
+    rates = 0.01 * np.cos(3.0 * np.arange(nodes.size)).reshape(nodes.shape)
+    energy, slope = charged.evaluate(nodes, own)
+    for weights, of in ((Weights(1.0, 0.0), energy), (Weights(0.0, 1.0), np.sum(slope * rates))):
+        by = charged.by_fields(nodes, rates, own, weights).by_remanence
+        assert np.sum(by * charged._shape.remanence) == pytest.approx(2 * of, rel=1e-9)

@@ -1,0 +1,37 @@
+"""Shells that overlap undeformed, without the equations of a scene, which refuses them in the same words."""
+
+from dolfinx import fem
+from mpi4py import MPI
+
+from magshell_fenicsx.models.carriers import on_meridian, on_surface
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
+
+MOST = 20_000  # cells in which they are looked for: some seconds
+
+
+def refuse_overlap(problem: Problem, cells: int) -> None:
+    """See that no shells that may touch overlap; of those that get thinner, and of images of a half, a scene does.
+
+    Raises
+    ------
+    MeshError
+        With the shells, by how much, and where.
+    """
+    pairs, h = problem.loads.pairs, problem.material.h
+    if not pairs or cells > MOST:
+        return
+    if problem.axisymmetric:
+        from magshell_fenicsx.parts.touching import on_meridian as curves
+
+        meridian = build_meridian(problem)
+        V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
+        r0 = meridian.placement(V)
+        curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule)
+        return
+    from magshell_fenicsx.parts.touching.building import touchings
+
+    surface = build_midsurface(problem, MPI.COMM_SELF)
+    V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
+    r0 = surface.placement(V)
+    touchings(pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule)
