@@ -14,6 +14,7 @@ from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 Array = NDArray[np.float64]
 POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it
 CHANGES = 4  # beside the path that are remembered
+FEW = 3  # states of a point before: it, and two that tell a slope
 TOGETHER = 0.5  # states nearer to each other than this part of the way from the point before belong to one point
 OWN = 0.3  # of a change: what newer ones do not have, at least
 STRAIGHT = 0.5  # of a way: along the path, at least
@@ -65,7 +66,7 @@ class Foreseen:
             self._points[-1] = [*self._points[-1][-CHANGES:], known]
         else:
             way = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
-            before = [point[-2:] for point in self._points[1 - POINTS :]]
+            before = [point[-FEW:] for point in self._points[1 - POINTS :]]
             self._points, self._ways = [*before, [known]], [*self._ways[1 - POINTS :], way]
         self._model = None
 
@@ -177,12 +178,14 @@ class Along:
                 places.append(at)
                 rows.append(np.asarray(at**powers))
                 values.append(last.rest - base.rest)
-            if len(point) > 1 and len(rows) < MOST:
-                change = last.u - point[-2].u
+            for one, other in pairwise(reversed(point)):
+                change = one.u - other.u
                 step, length = float(direction @ change) / way, float(np.linalg.norm(change)) / way
-                if STRAIGHT * length < abs(step) and length < SLOPE:
+                if len(rows) < MOST and STRAIGHT * length < abs(step) and length < SLOPE:
+                    at = float(direction @ (one.u - base.u)) / way
                     rows.append(np.asarray((at**powers - (at - step) ** powers) / step))
-                    values.append(np.asarray((last.rest - point[-2].rest) / step))
+                    values.append(np.asarray((one.rest - other.rest) / step))
+                    break
             if len(rows) == MOST:
                 break
         n = len(rows)

@@ -160,8 +160,8 @@ class Pairs:
     """The sums over pairs of cells with nodes (cells, k, 3)."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        source, behind = (Path(__file__).with_name(name) for name in ("pairs.c", "close.c"))
-        self._ffi, self._lib = native(source, FUNCTIONS, comm, behind)
+        source, *behind = (Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c"))
+        self._ffi, self._lib = native(source, FUNCTIONS, comm, *behind)
 
     def add(
         self,

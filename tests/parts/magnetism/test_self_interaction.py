@@ -217,9 +217,12 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         paths.append(read_path(tmp_path / str(ranks)))
     for other in paths[1:]:
+        assert len(other) == len(paths[0])
         for name in ("interaction", "p_over_pc", "w_over_h", "energy", "magnetic"):
             first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
             assert values == pytest.approx(first, rel=1e-7, abs=1e-13), name
+    iterations = [[int(row["iterations"]) for row in rows] for rows in paths[1:]]
+    assert np.ptp(iterations, axis=0).max() <= 1, "forces are foreseen by the same D on any number of ranks"
 
 
 def smooth(x: Array, sign: float) -> Array:
