@@ -159,6 +159,15 @@ class FiniteElementSystem:
         """See `System` and `Roughly`."""
         return Evaluated(self, u, mu).residual(rough=rough)
 
+    def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
+        """See `Roughly`."""
+        step = self.with_ghosts(du)
+        return all(
+            self.at(State(u, dict(mu))).of(
+                lambda: [t.knows_along(step) for t in self.of_all.terms] if self.of_all else []
+            )
+        )
+
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """See `Evaluated.forces`."""
         return Evaluated(self, u, mu).forces(name)

@@ -25,10 +25,12 @@ from magshell_fenicsx.continuation.system import Beside, Rest, Vector
 from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int32]
 COLUMNS = 128  # for which products are computed at once where all entries are needed
 FUNCTIONS = """
     void of_doubles(int64_t, const int32_t *, const int32_t *, const double *, const double *, double *);
     void of_floats(int64_t, const int32_t *, const int32_t *, const float *, const double *, double *);
+    void of_upper(int64_t, const int32_t *, const int32_t *, const float *, const double *, double *);
 """
 
 
@@ -58,6 +60,37 @@ class WholeTerm(Term, Protocol):
     def add_foreseen(self, b: Array, factor: float) -> None:
         """As `add_residual`, by what is known of states near by; collective."""
 
+    def knows_along(self, step: Array) -> bool:
+        """Whether what is known of states near by is right along a change of all unknowns; collective."""
+
+
+@dataclass(frozen=True)
+class Singles:
+    """A matrix of (3, 3) blocks in single precision; of a symmetric one only the blocks on and above the diagonal.
+
+    Attributes
+    ----------
+    starts, columns, values
+        Of rows of blocks, each row's columns in order.
+    upper
+        Whether the blocks below the diagonal are left out.
+    """
+
+    starts: Indices
+    columns: Indices
+    values: NDArray[np.float32]
+    upper: bool
+
+    @classmethod
+    def of(cls, A: bsr_array, *, upper: bool) -> "Singles":
+        """A matrix, if `upper` a symmetric one."""
+        if not upper:
+            starts, columns = (np.asarray(each, dtype=np.int32) for each in (A.indptr, A.indices))
+            return cls(starts, columns, A.data.astype(np.float32), upper)
+        kept = np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr)) <= A.indices
+        starts = np.append(0, np.cumsum(kept, dtype=np.int32))[A.indptr].astype(np.int32)
+        return cls(starts, A.indices[kept].astype(np.int32), A.data[kept].astype(np.float32), upper)
+
 
 class Blocks:
     """Products of matrices of (3, 3) blocks with vectors; the constructor is collective."""
@@ -65,15 +98,19 @@ class Blocks:
     def __init__(self, comm: MPI.Comm) -> None:
         self._ffi, self._lib = native(Path(__file__).with_name("whole.c"), FUNCTIONS, comm)
 
-    def times(self, A: bsr_array, v: Array) -> Array:
-        """A v; the entries of A may be single ones."""
-        product, p = np.empty(A.shape[0]), self._ffi.from_buffer
-        starts, columns = (np.asarray(each, dtype=np.int32) for each in (A.indptr, A.indices))
-        values, x = np.ascontiguousarray(A.data), np.tile(v.reshape(-1, 3), 3)
-        single = values.dtype == np.float32
-        arrays = p("int32_t[]", starts), p("int32_t[]", columns), p("float[]" if single else "double[]", values)
-        of_these = self._lib.of_floats if single else self._lib.of_doubles
-        of_these(len(starts) - 1, *arrays, p("double[]", x), p("double[]", product))
+    def times(self, A: bsr_array | Singles, v: Array) -> Array:
+        """A v."""
+        p, lib, upper = self._ffi.from_buffer, self._lib, isinstance(A, Singles) and A.upper
+        x = np.ascontiguousarray(v) if upper else np.tile(v.reshape(-1, 3), 3)
+        if isinstance(A, Singles):
+            starts, columns = A.starts, A.columns
+            values, of_these = p("float[]", A.values), lib.of_upper if upper else lib.of_floats
+        else:
+            starts, columns = (np.asarray(each, dtype=np.int32) for each in (A.indptr, A.indices))
+            values, of_these = p("double[]", np.ascontiguousarray(A.data)), lib.of_doubles
+        product = np.empty(3 * (len(starts) - 1))
+        arrays = p("int32_t[]", starts), p("int32_t[]", columns), values, p("double[]", x)
+        of_these(len(starts) - 1, *arrays, p("double[]", product))
         return product
 
 
@@ -85,12 +122,15 @@ class OfTerm:
     ----------
     stored
         What is stored of this rank's own unknowns.
+    singles
+        The same for products that need not be better.
     left_out
         Entries that are not counted.
     """
 
     factor: float
     stored: bsr_array
+    singles: Singles
     acting: Acting
     left_out: csr_array | None = None
 
@@ -106,7 +146,7 @@ class Rows:
         """See `Rest`."""
         own, everywhere = self.matrix.held
         whole = np.where(everywhere, 0.0, np.concatenate(self.matrix.comm.allgather(v)))
-        return np.where(own, 0.0, self.matrix.product(self.parts, whole))
+        return np.where(own, 0.0, self.matrix.product(self.parts, whole, singles=True))
 
     def scaled(self, factor: float) -> "Rows":
         """See `Rest`."""
@@ -148,7 +188,7 @@ class WholeMatrix:
         self._blocks = Blocks(comm)
         self.comm, self.held = comm, (held, np.concatenate(comm.allgather(held)))
         self._whole: tuple[Array, Array, PETSc.Mat] | None = None
-        self._stored: dict[str, tuple[Acting, bsr_array]] = {}
+        self._stored: dict[str, tuple[Acting, bsr_array, Singles]] = {}
         self._found: tuple[bsr_array, csr_array] | None = None
 
     def _made(self) -> tuple[Array, Array, PETSc.Mat]:
@@ -213,22 +253,23 @@ class WholeMatrix:
 
     def of_term(self, factor: float, term: WholeTerm, *, rough: bool = False) -> OfTerm:
         """A term, what it stores summed over the ranks. Collective."""
-        acting, (before, stored) = term.acting(rough=rough), self._stored.get(term.name, (None, None))
-        if before is not acting or stored is None:
+        acting, known = term.acting(rough=rough), self._stored.get(term.name)
+        if known is None or known[0] is not acting:
             stored = self._own_blocks(acting.stored)
-            self._stored[term.name] = acting, stored
-        return OfTerm(factor, stored, acting)
+            known = self._stored[term.name] = acting, stored, Singles.of(stored, upper=self.comm.size == 1)
+        return OfTerm(factor, *known[1:], acting)
 
     def rows(self, term: WholeTerm) -> Array:
         """The rows (own unknowns, all) of a term, supports too. Collective."""
         return self._all(self.of_term(1.0, term))
 
-    def product(self, parts: Sequence[OfTerm], whole: Array) -> Array:
+    def product(self, parts: Sequence[OfTerm], whole: Array, *, singles: bool = False) -> Array:
         """Terms times factors, supports too, with changes of all unknowns; of own unknowns. Collective."""
         product = np.zeros(3 * self._owned)
         for part in parts:
             others = part.acting.times_others(whole[:, None]).reshape(-1, 3)
-            product += part.factor * (self._blocks.times(part.stored, whole) + self._own(others).ravel())
+            stored = self._blocks.times(part.singles if singles else part.stored, whole)
+            product += part.factor * (stored + self._own(others).ravel())
             if part.left_out is not None:
                 product -= part.factor * (part.left_out @ whole)
         return product

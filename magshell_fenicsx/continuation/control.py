@@ -255,9 +255,9 @@ def refined_tangent(
         refined = near.refined(system.residual, t)
         return refined[0] if refined else None
     assert isinstance(system, Roughly)
-    for known in range(MOST_REFINEMENTS):
+    for _ in range(MOST_REFINEMENTS):
         refined = near.refined(partial(system.residual, rough=True), t)
-        if refined is None or (known and refined[1] == 0):
+        if refined is None or system.knows_along(state.u, state.mu, refined[0][0]):
             return refined[0] if refined else None
         t = refined[0]
         near.stiffness(system.residual, t[0], t[0])  # what is foreseen from now on is right along t

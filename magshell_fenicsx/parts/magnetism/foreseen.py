@@ -1,24 +1,27 @@
 """Forces of all charges on each other near states at which they were computed, along a path and beside it."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
 
-from magshell_fenicsx.assembly.whole import Blocks
+from magshell_fenicsx.assembly.whole import Blocks, Singles
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 
 Array = NDArray[np.float64]
 POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it
 CHANGES = 4  # beside the path that are remembered
+FEW = 3  # states of a point before: it, and two that tell a slope
 TOGETHER = 0.5  # states nearer to each other than this part of the way from the point before belong to one point
 OWN = 0.3  # of a change: what newer ones do not have, at least
 STRAIGHT = 0.5  # of a way: along the path, at least
 TURNED = 0.02  # angle by which a node has turned since D was turned: it is turned again
 APART = 0.1  # of the larger one of two places along the path: their distance, at least
+LAST = 6  # products with D that are kept
+ALONG = 0.999  # cosine of the angle between a change and a direction along which forces are then known
 SLOPE = 0.05  # of a way: two states as near as this one to each other tell a slope
 
 
@@ -39,19 +42,21 @@ class Known:
 class Foreseen:
     """Forces near states at which they were computed, by an earlier second derivative D and by what D lacks.
 
-    Along the path, the forces without D u are a polynomial through its last points. It has slopes at points where two
-    states near each other are known. Changes of u beside the path correct D and the polynomial by secants, the newest
-    change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth along the path, and
+    small beside it. Along the path, the forces without D u are a polynomial through its last points. It has slopes at
+    points where two states near each other are known. Changes of u beside the path correct D and the polynomial by
+    secants, the newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several
+    steps).
     """
 
-    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array]) -> None:
-        self._blocks, self._turns = blocks, turns
+    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool) -> None:
+        self._blocks, self._turns, self._alone = blocks, turns, alone  # on one rank
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
         self._D: ActingOnEachOther | None = None
-        self._stored: bsr_array | None = None  # of D, turned to `_turned`
+        self._stored: Singles | None = None  # of D, turned to `_turned`
         self._turned: Array | None = None
-        self._last: tuple[Array, Array] | None = None  # the last u and D u
+        self._products = deque[tuple[Array, Array]](maxlen=LAST)  # the last u and D u
         self._model: tuple[Along, list[tuple[Array, Array]]] | None = None
 
     def learn(self, u: Array, forces: Array) -> None:
@@ -61,7 +66,7 @@ class Foreseen:
             self._points[-1] = [*self._points[-1][-CHANGES:], known]
         else:
             way = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
-            before = [point[-2:] for point in self._points[1 - POINTS :]]
+            before = [point[-FEW:] for point in self._points[1 - POINTS :]]
             self._points, self._ways = [*before, [known]], [*self._ways[1 - POINTS :], way]
         self._model = None
 
@@ -74,8 +79,20 @@ class Foreseen:
         along, changes = self._model = self._model or self._made()
         foreseen, s = self._product(u) + along.rest(u), u - along.base.u
         for q, y in changes:
-            foreseen += (q @ s) * y
+            foreseen = foreseen + (q @ s) * y
         return foreseen
+
+    def knows_along(self, u: Array, step: Array) -> bool:
+        """Whether the forces at two states near each other and u are known, one from the other along a direction."""
+        if not self._points or self._begins(u):
+            return False
+        near, size = SLOPE * self._ways[-1], float(np.linalg.norm(step))
+        for one, other in pairwise(self._points[-1]):
+            change, away = one.u - other.u, float(np.linalg.norm(u - one.u))
+            way = float(np.linalg.norm(change))
+            if max(way, away) < near and abs(change @ step) > ALONG * size * way:
+                return True
+        return False
 
     def _begins(self, u: Array) -> bool:
         """Whether a state is not of the last point."""
@@ -89,8 +106,10 @@ class Foreseen:
         turned = D.turned(self._turns(u, of_D))
         if turned is None and before is not None:
             return
-        self._D, self._stored, self._turned = D, D.stored if turned is None else turned, u
-        self._last = self._model = None
+        self._D, self._turned = D, u
+        self._stored = Singles.of(D.stored, upper=self._alone) if turned is None else turned
+        self._model = None
+        self._products.clear()
         self._points = [[Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points]
 
     def _made(self) -> tuple["Along", list[tuple[Array, Array]]]:
@@ -110,12 +129,14 @@ class Foreseen:
         return along, changes
 
     def _product(self, u: Array) -> Array:
-        if self._last is None or not np.array_equal(u, self._last[0]):
-            assert self._D
-            assert self._stored is not None
-            others = self._D.times_others(u[:, None]).ravel()
-            self._last = u, np.asarray(self._blocks.times(self._stored, u) + others)
-        return self._last[1]
+        for before, product in self._products:
+            if np.array_equal(u, before):
+                return product
+        assert self._D
+        assert self._stored
+        product = self._blocks.times(self._stored, u)
+        self._products.appendleft((u, product))
+        return product
 
 
 @dataclass(frozen=True)
@@ -157,12 +178,14 @@ class Along:
                 places.append(at)
                 rows.append(np.asarray(at**powers))
                 values.append(last.rest - base.rest)
-            if len(point) > 1 and len(rows) < MOST:
-                change = last.u - point[-2].u
+            for one, other in pairwise(reversed(point)):
+                change = one.u - other.u
                 step, length = float(direction @ change) / way, float(np.linalg.norm(change)) / way
-                if STRAIGHT * length < abs(step) and length < SLOPE:
+                if len(rows) < MOST and STRAIGHT * length < abs(step) and length < SLOPE:
+                    at = float(direction @ (one.u - base.u)) / way
                     rows.append(np.asarray((at**powers - (at - step) ** powers) / step))
-                    values.append(np.asarray((last.rest - point[-2].rest) / step))
+                    values.append(np.asarray((one.rest - other.rest) / step))
+                    break
             if len(rows) == MOST:
                 break
         n = len(rows)

@@ -1,5 +1,6 @@
 """Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees of it."""
 
+from collections import deque
 from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.near import Near
 from magshell_fenicsx.parts.magnetism.own_field import own_field
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
+from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.seen import Sight
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
+REMEMBERED = 3  # energies and forces: a point of a path is looked at again after its tangent
 SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
@@ -70,9 +73,9 @@ class InteractionTerm:
                 f"at most {LARGEST} are allowed: take a coarser mesh or a lower mesh.degree"
             )
         self._given: tuple[Array, ...] = ()
-        self._seen: tuple[Array, float, Array] | None = None
-        self._blocks = Blocks(self._comm)
-        self._foreseen = Foreseen(self._blocks, self._turns)
+        self._seen = deque[tuple[Array, float, Array]](maxlen=REMEMBERED)
+        self._blocks, self._turning = Blocks(self._comm), Turning(self._comm)
+        self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
             None  # beside its nodes and u
         )
@@ -129,6 +132,13 @@ class InteractionTerm:
         self._nodes()  # what is known is forgotten if shape or remanence changed
         foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2]) if self._stiff else None
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
+
+    def knows_along(self, step: Array) -> bool:
+        """See `assembly.whole.WholeTerm`."""
+        self._nodes()
+        there, nodes = whole(self._u), self._u.function_space.dofmap.index_map
+        own = step.reshape(-1, 3)[: nodes.size_local]
+        return self._foreseen.knows_along(there.ravel(), np.concatenate(self._comm.allgather(own)).ravel())
 
     def compile_tangent(self) -> None:
         """A sum over pairs of charges."""
@@ -193,11 +203,13 @@ class InteractionTerm:
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         far, near = self._charged.boxes(nodes, own)
-        beside = np.zeros((local, count), dtype=bool)
-        for cell, row in zip(own, near, strict=True):
-            columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
-            beside[row_of[cell][:, None], columns] = True
-        stiffness = Stiffness(beside, self._scale, row_of, column_of, turn)
+        stored, touching = np.zeros((local, count), dtype=bool), np.zeros((count, count), dtype=bool)
+        for into, row_in, pairs in ((stored, row_of, near), (touching, self._cells.nodes, far.beside(own))):
+            for cell, row in zip(own, pairs, strict=True):
+                columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
+                into[row_in[cell][:, None], columns] = True
+        self._comm.Allreduce(MPI.IN_PLACE, touching, MPI.LOR)  # the same blocks on any number of ranks
+        stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
         try:
             self._charged.evaluate(nodes, own, stiffness)
         except Touching:
@@ -206,7 +218,7 @@ class InteractionTerm:
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign)
+            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign, touching[numbers][stored], self._turning)
             for sign in ([1.0, -1.0] if several else [1.0, 1.0])
         )
         return even, odd
@@ -214,18 +226,20 @@ class InteractionTerm:
     def _evaluated(self) -> tuple[float, Array]:
         """The energy of this rank's part and its gradient by local nodes; collective."""
         nodes, V = self._nodes(), self._u.function_space
-        if self._seen is None or not np.array_equal(nodes, self._seen[0]):
-            try:
-                energy, gradient = self._charged.evaluate(nodes, self._cells.own)
-            except Touching:  # there is no such equilibrium
-                k = self._cells.nodes.shape[1]
-                energy, gradient = np.nan, np.full((len(self._cells.own), k, 3), np.nan)
-            forces = np.zeros_like(self._u.x.array)
-            np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient)
-            self._seen = nodes, self._scale * energy, forces
-            if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
-                self._foreseen.learn(whole(self._u).ravel(), forces)
-        return self._seen[1:]
+        for seen, energy, forces in self._seen:
+            if np.array_equal(nodes, seen):
+                return energy, forces
+        try:
+            energy, gradient = self._charged.evaluate(nodes, self._cells.own)
+        except Touching:  # there is no such equilibrium
+            k = self._cells.nodes.shape[1]
+            energy, gradient = np.nan, np.full((len(self._cells.own), k, 3), np.nan)
+        forces = np.zeros_like(self._u.x.array)
+        np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient)
+        self._seen.appendleft((nodes, self._scale * energy, forces))
+        if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
+            self._foreseen.learn(whole(self._u).ravel(), forces)
+        return self._scale * energy, forces
 
     def _nodes(self) -> Array:
         """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes them changed."""
@@ -236,8 +250,9 @@ class InteractionTerm:
         if factor is not None:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._seen, self._stiff = given, None, None
-            self._foreseen = Foreseen(self._blocks, self._turns)
+            self._given, self._stiff = given, None
+            self._seen.clear()
+            self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
         return self._copies.of((r0 + u)[self._cells.nodes])

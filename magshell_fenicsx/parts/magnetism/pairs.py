@@ -28,8 +28,6 @@ FUNCTIONS = """
         const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
     void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
         int64_t, const double *, const double *, double *);
-    void turn_blocks(int64_t, const int32_t *, const int32_t *, const double *, const double *, double, const double *,
-        const int64_t *, const double *, float *);
     typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S; const double *charges, *thickness,
         *heights; int64_t P; const double *T, *X, *weights, *gauss; double h, depth, least, inside,
         precision; } Cells;
@@ -164,8 +162,8 @@ class Pairs:
     """The sums over pairs of cells with nodes (cells, k, 3)."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        source, behind = (Path(__file__).with_name(name) for name in ("pairs.c", "close.c"))
-        self._ffi, self._lib = native(source, FUNCTIONS, comm, behind)
+        source, *behind = (Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c"))
+        self._ffi, self._lib = native(source, FUNCTIONS, comm, *behind)
 
     def add(
         self,
@@ -306,20 +304,6 @@ class Pairs:
             self._lib.translate(
                 len(one), *numbers, M.shape[1], p(ends), G.shape[1], M.shape[2], *(p(each) for each in arrays), p(L)
             )
-
-    def turned(self, stiffness: Stiffness, sign: float, number: Ints, q: Array) -> NDArray[np.float32] | None:
-        """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes, 4), scalar last.
-
-        None where there are several images, whose blocks are not stored apart.
-        """
-        starts, columns, count = stiffness.starts, stiffness.columns, len(stiffness.columns)
-        if len(stiffness.turn) > 2:
-            return None
-        p, turned = self._pointer, np.empty((count, 3, 3), dtype=np.float32)
-        images = p(stiffness.blocks[count:]) if len(stiffness.turn) > 1 else self._ffi.NULL
-        arrays = p(starts), p(columns), p(stiffness.blocks[:count]), images, sign, p(stiffness.turn[-1])
-        self._lib.turn_blocks(len(starts) - 1, *arrays, p(number), p(q), p(turned))
-        return turned
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous

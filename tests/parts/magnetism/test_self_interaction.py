@@ -13,7 +13,7 @@ from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
 from test_own_field import sphere_of_triangles
 
 from magshell_fenicsx import Scene
-from magshell_fenicsx.assembly.whole import WholeMatrix
+from magshell_fenicsx.assembly.whole import Singles, WholeMatrix
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.parts.magnetism.coulomb import Charged
@@ -173,9 +173,14 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
     term._u.x.array[:] = 0.0
     flat = term.both(rough=False)[0]
-    turned = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel()))
-    assert np.abs(turned - turned.T).max() < 1e-6 * np.abs(turned).max()
-    products = [stored @ v.ravel() + flat.times_others(v.reshape(-1, 1))[:, 0] for stored in (flat.stored, turned)]
+    turned, times = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel())), term._blocks.times
+    stored, rest = flat.stored, flat.stored.copy()
+    rest.data[flat.beside] = 0.0
+    exact, rounding = stored @ v.ravel(), np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel()))
+    for upper in (True, False):
+        assert (np.abs(times(Singles.of(stored, upper=upper), v.ravel()) - exact) <= rounding).all()
+    others = flat.times_others(v.reshape(-1, 1))[:, 0]
+    products = [exact + others, times(turned, v.ravel()) + rest @ v.ravel() + others]
     as_it_was, with_nodes = (np.linalg.norm(each - slope) for each in products)
     assert with_nodes < min(0.3 * as_it_was, 0.02 * np.linalg.norm(slope)), "the bend stretches by 4 %, too"
     K = rows_of(systems[0], states[0], terms[0])
@@ -212,9 +217,12 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         paths.append(read_path(tmp_path / str(ranks)))
     for other in paths[1:]:
+        assert len(other) == len(paths[0])
         for name in ("interaction", "p_over_pc", "w_over_h", "energy", "magnetic"):
             first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
             assert values == pytest.approx(first, rel=1e-7, abs=1e-13), name
+    iterations = [[int(row["iterations"]) for row in rows] for rows in paths[1:]]
+    assert np.ptp(iterations, axis=0).max() <= 1, "forces are foreseen by the same D on any number of ranks"
 
 
 def smooth(x: Array, sign: float) -> Array:
