@@ -9,7 +9,7 @@ amplitude "natural_stretch". The derivatives by the displacement and by this are
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -19,7 +19,27 @@ from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.touching import Touching
+
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ByGrowth:
+    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
+
+    of: "Touching"
+    order: int = 1
+    amplitude: str | None = None
+
+    def energy(self) -> float:
+        """On this rank's part."""
+        return self.of.by_growth(self.order)
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor times the gradient of the first one; collective."""
+        self.of.add_by_growth(b, factor)
 
 
 @dataclass(frozen=True)

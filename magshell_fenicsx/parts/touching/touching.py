@@ -29,7 +29,8 @@ from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
-from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
+from magshell_fenicsx.parts.touching.expanded import Expanded
+from magshell_fenicsx.parts.touching.faces import ByGrowth, Faces, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.nearest import (
     SIGNS,
@@ -58,23 +59,6 @@ class Number:
     """A number that a state sets."""
 
     value: float
-
-
-@dataclass(frozen=True)
-class ByGrowth:
-    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
-
-    of: "Touching"
-    order: int = 1
-    amplitude: str | None = None
-
-    def energy(self) -> float:
-        """On this rank's part."""
-        return self.of.by_growth(self.order)
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first one; collective."""
-        self.of.add_by_growth(b, factor)
 
 
 class Touching:
@@ -126,6 +110,7 @@ class Touching:
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
+        self._about: Expanded | None = None
 
     # as a term
 
@@ -137,8 +122,7 @@ class Touching:
     def compile_residual(self) -> None:
         """It has no forms."""
 
-    def compile_tangent(self) -> None:
-        """It has no forms."""
+    compile_tangent = compile_residual
 
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
@@ -385,6 +369,9 @@ class Touching:
     def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
+        if self._about:
+            self._at, self._points = np.array(self._now()), self._about.points
+            return self._about.at(self._facing, self._at, self.stiffness.value, self._h)
         u, grown = self._now(), self._faces.value if self._faces else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
@@ -395,6 +382,15 @@ class Touching:
             self._joined = Joined.of(self._places, BLUR * self._h)
         joined = self._joined
         return self._places, joined, penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
+
+    def pressed(self) -> Expanded:
+        """What is pressed at the present state."""
+        self._pressed()
+        return Expanded.of(self._cells, self._r0, self._h, self._points, self._places, self._joined)
+
+    def expand_about(self, pressed: Expanded) -> None:
+        """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
+        self._about = pressed.on(self._r0)
 
     def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
         """What the Hessian of joined places has besides those of each."""
