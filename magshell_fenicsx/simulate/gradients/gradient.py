@@ -118,9 +118,10 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
 def _expand(scene: Scene, other: Scene, state: State) -> None:
     """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
     at = scene.model.system.at(state)
-    same: Sequence[Any] = other.model.touchings  # of the same kind
-    for touching, of_other in zip(scene.model.touchings, same, strict=True):
-        of_other.expand_about(at.of(touching.pressed))
+    of_one: Sequence[Any] = scene.model.touchings
+    of_other: Sequence[Any] = other.model.touchings
+    for touching, same in zip(of_one, of_other, strict=True):
+        same.expand_about(at.of(touching.pressed))
     for name, (pressing, _) in scene.model.contacts.items():
         other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
 
