@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
@@ -239,6 +240,22 @@ def pressing(scene: Scene, state: State) -> list[Contact]:
     """The bodies that touch."""
     contacts = scene.problem.loads.contacts
     return [contact for contact in contacts if scene.model.region(state, contact.amplitude).penetration > 0]
+
+
+def refuse_meeting(scene: Scene, state: State, of: str) -> None:
+    """See that no shells touch where a second variation is differentiated; collective.
+
+    Raises
+    ------
+    CaseError
+        With the shells that do.
+    """
+    for pair, deep in between(scene, state):
+        if deep > 0:
+            raise CaseError(
+                f"{of}: has no gradient where shells touch ({pair.words}): where they do changes within far less than "
+                "a difference takes; take differences of runs"
+            )
 
 
 def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:

@@ -9,7 +9,7 @@ amplitude "natural_stretch". The derivatives by the displacement and by this are
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -17,9 +17,29 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
-from magshell_fenicsx.parts.touching.nearest import Cells, Longs
+from magshell_fenicsx.parts.touching.nearest import SIGNS, Cells, Longs, Places, inverse, jets, slopes
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.touching import Touching
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ByGrowth:
+    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
+
+    of: "Touching"
+    order: int = 1
+    amplitude: str | None = None
+
+    def energy(self) -> float:
+        """On this rank's part."""
+        return self.of.by_growth(self.order)
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor times the gradient of the first one; collective."""
+        self.of.add_by_growth(b, factor)
 
 
 @dataclass(frozen=True)
@@ -213,3 +233,46 @@ def slope_of(n: Array, beta: Array, parts: int) -> Array:
     half = beta.shape[1] // 2
     thicker = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
     return np.asarray(np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts])
+
+
+def hessians(
+    cells: Cells,
+    at: Places,
+    geometry: tuple[Array, Array, Array, Longs],
+    placed: Array,
+    penalty: tuple[Array, Array, Array],
+) -> Array:
+    """Those of the weighted penalty (n, dofs, dofs) by the nodes of both cells, see `touching`.
+
+    Parameters
+    ----------
+    geometry
+        Distances, normals, beta and its nodes.
+    placed
+        All nodes (nodes, parts).
+    penalty
+        Weights, and first and second derivatives by the penetration.
+    """
+    (d, n, beta, nodes), (weight, first, second) = geometry, penalty
+    half, parts = nodes.shape[1] // 2, placed.shape[1]
+    shapes, y = zip(*jets(cells.element, at.X, placed[nodes[:, half:]]), strict=True)
+    normal = np.column_stack([n, 0 * d])[:, None, :parts]
+    off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :parts]
+    A = slopes(off[:, 0], *y[1:])[1]
+    M = np.einsum("nik,nkl,njl->nij", at.free, inverse(at.free, A), at.free)
+    C = np.zeros((len(d), 2, *beta.shape[1:], parts))
+    for a in range(2):
+        across = y[1 + a][:, None] * (SIGNS[:parts] > 0)
+        across -= np.sum(normal * across, axis=2, keepdims=True) * normal
+        C[:, a] = -beta[:, :, None] * across
+        C[:, a, half:] -= shapes[1 + a][:, :, None] * off
+    bent = weight * first / d
+    rows = [slope_of(n, beta, parts)[:, None], (beta[:, :, None] * normal)[:, None], C]
+    left = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
+    middle = np.zeros((len(d), 4, 4))
+    middle[:, 0, 0], middle[:, 1, 1], middle[:, 2:, 2:] = weight * second, bent, bent[:, None, None] * M
+    H = left.transpose(0, 2, 1) @ (middle @ left)
+    both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
+    for i in range(3):
+        H[:, i::parts, i::parts] -= both
+    return np.asarray(H)

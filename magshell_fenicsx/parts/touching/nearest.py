@@ -32,6 +32,7 @@ STRIP = 500  # vertices from which ways are searched together
 ROUNDS = 30  # Newton's steps at most
 EXACT = 1e-10  # after a smaller step, in the reference cell, the place is exact: steps converge quadratically
 INWARDS = 1e-17  # a smaller change of a barycentric coordinate leads to no side
+FOLLOWING = 2  # Newton's steps after a small change
 FLAT = 1e-3  # of the determinant of a plane's Hessian: below it the step takes the plane's
 ON_SIDE = 1e-12  # a barycentric coordinate that is zero
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -225,6 +226,15 @@ def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Arra
         moving = moving[np.abs(X[moving] - at).max(axis=1) > EXACT]
     (_, y), *_ = jets(cells.element, X, nodal, 0)
     return X, free_at(cells, x, nodal, X), distances(x - y)
+
+
+def followed(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -> Array:
+    """The same places of triangles that have changed a little, in the same free directions, also beyond a side."""
+    for _ in range(FOLLOWING):
+        (_, y), *more = jets(cells.element, X, nodal)
+        g, A = slopes(straight(x - y), *(each for _, each in more))
+        X = X - _reduced(free, A, g)
+    return X
 
 
 def distances(off: Array) -> Array:

@@ -11,7 +11,7 @@ rule on each cell. At a free end one is next to the end, which an edge stands on
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
@@ -22,10 +22,12 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
+from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
+from magshell_fenicsx.parts.touching.expanded import expanded
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, ROUNDS
-from magshell_fenicsx.parts.touching.rules import BEFORE
+from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, FOLLOWING, ROUNDS
+from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
 
@@ -34,55 +36,6 @@ Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
 START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
 SAME = 1e-9  # of h: places of two cells at the same distance are one
-
-
-@dataclass(frozen=True)
-class Rule:
-    """Points on the cells of two shells.
-
-    Attributes
-    ----------
-    cell, shape, weight
-        (n,) number, (n, functions) of that cell, and undeformed area over R^2, all around.
-    first
-        (n,) whether it is on the first shell.
-    normal
-        (n, 2) undeformed.
-    on_edge
-        (n,) whether it is next to a free end.
-    """
-
-    cell: Longs
-    shape: Array
-    weight: Array
-    first: Inside
-    normal: Array
-    on_edge: Inside
-
-
-@dataclass(frozen=True)
-class Faced:
-    """Points and the places that are nearest to them.
-
-    Attributes
-    ----------
-    point, cell, X
-        (n,) number of the point, cell of the place, and where it is in that.
-    free
-        (n,) whether it may move along the curve.
-    distance
-        (n,) over R.
-    """
-
-    point: Longs
-    cell: Longs
-    X: Array
-    free: Inside
-    distance: Array
-
-    def of(self, which: Inside | Longs) -> "Faced":
-        """Some of them."""
-        return Faced(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 class MeridianTouching:
@@ -108,14 +61,15 @@ class MeridianTouching:
         V = r0.function_space
         self._nodes = V.dofmap.list.astype(np.int64)
         self._element, self._r0 = V.element.basix_element, np.array(r0.x.array.reshape(-1, 2))
-        self._sides, self._beside = sides, _beside(self._nodes)
+        self._sides, self._beside = sides, beside(self._nodes)
         self._rule = self._points(degree // 2 + 1)
         self._normals = self._cell_normals()
         self._at: Array = np.full_like(self._r0, np.nan)
-        self._places = _nowhere()
+        self._places = nowhere()
         self.looks: Sequence[Look] = ()  # see `InSteps`
         self.look: Look | None = None
         self._looked_at = Kept[tuple[Array, Faced]]()
+        self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
         k = self._element.degree
         self._start = np.linspace(0.0, 1.0, START * k + 1, dtype=np.float64)
 
@@ -260,6 +214,9 @@ class MeridianTouching:
     def _pressed(self) -> Faced:
         """The places that are pressed at the present state."""
         u = self._now()
+        if self._about:
+            self._at, at = np.array(u), self._about[0]
+            return self._followed(at) if len(at.point) else at
         if not np.array_equal(u, self._at):
             self._at, self._places = self._looked_at.of((u,), lambda: self._facing(np.array(u)))
         return self._places
@@ -269,8 +226,30 @@ class MeridianTouching:
         return u, at.of(~self._left_to_edges(at))
 
     def _penalty(self, at: Faced) -> tuple[Array, Array, Array]:
+        if self._about:
+            return expanded(self._h - at.distance, self._about[1], self.stiffness.value, self._h)
         pressed = penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
         return self.look.of(at.point, pressed) if self.look else pressed
+
+    def pressed(self) -> tuple[Faced, Array]:
+        """The places that are pressed at the present state, and their penetrations."""
+        at = self._pressed()
+        return at, self._h - at.distance
+
+    def expand_about(self, pressed: tuple[Faced, Array]) -> None:
+        """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
+        self._about = pressed
+
+    def _followed(self, at: Faced) -> Faced:
+        """Places after a small change, free ones also beyond an end of their cells."""
+        r, X = self._r0 + self._at, at.X
+        x, nodal = self._x_of(r)[at.point], r[self._nodes[at.cell]]
+        for _ in range(FOLLOWING):
+            y, first, second = self._jets(X, nodal)
+            off = x - y
+            bent = np.sum(first * first - off * second, axis=1)
+            X = X + np.where(at.free, np.sum(off * first, axis=1) / np.where(at.free, bent, 1.0), 0.0)
+        return replace(at, X=X, distance=np.linalg.norm(x - self._jets(X, nodal)[0], axis=1))
 
     def _points(self, count: int) -> Rule:
         """So many Gauss's points in each cell, in those with a free end the end among them."""
@@ -278,7 +257,7 @@ class MeridianTouching:
         parts = list[tuple[Longs, Array, Array, Inside, Array, Inside]]()
         for begins, last in ((False, False), (True, False), (False, True), (True, True)):
             cells = np.flatnonzero(np.any(self._sides, axis=0) & (ends == [begins, last]).all(axis=1))
-            X, w = _rule(count, begins, last)
+            X, w = rule_on_line(count, begins, last)
             table = self._table(1, X)
             x, along = np.einsum("dqk,cki->dcqi", table, self._r0[self._nodes[cells]])
             speed = np.linalg.norm(along, axis=2)
@@ -316,7 +295,7 @@ class MeridianTouching:
             parts.append((points[i], cells[j]))
         point, cell = (np.concatenate(each) for each in zip(*parts, strict=True))
         if not len(point):
-            return _nowhere()
+            return nowhere()
         at = self._projected(x, nodal, point, cell)
         return self._nearest(at.of(at.distance < reach), x, nodal)
 
@@ -448,36 +427,8 @@ def touchings(
     return made
 
 
-def _beside(nodes: Longs) -> Longs:
-    """(cells, 2): the cell beyond each end; -1 where there is none."""
-    beyond = np.full((len(nodes), 2), -1, dtype=np.int64)
-    of = dict[int, tuple[int, int]]()
-    for cell, end in np.ndindex(len(nodes), 2):
-        if other := of.get(vertex := int(nodes[cell, end])):
-            beyond[cell, end], beyond[other] = other[0], cell
-        of[vertex] = cell, end
-    return beyond
-
-
-def _rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
-    """Points and weights on [0, 1]: Gauss's, or Radau's and Lobatto's with points next to ends."""
-    from scipy.special import roots_jacobi  # takes long to import
-
-    x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
-    w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
-    end = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
-    x = np.concatenate([[-1 + 2 * BEFORE] * begins, x, [1 - 2 * BEFORE] * ends])
-    w = np.concatenate([[end] * begins, w, [end] * ends])
-    return (x + 1) / 2, w / 2
-
-
 def _entries(H: Array, nodes: Longs, size: int) -> Entries:
     """Blocks (n, dofs, dofs) by the unknowns at nodes (n, functions), `size` at each."""
     dofs = (size * nodes[..., None] + np.arange(size)).reshape(len(nodes), size * nodes.shape[1])
     rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
     return rows.ravel(), columns.ravel(), H.ravel()
-
-
-def _nowhere() -> Faced:
-    nothing = np.zeros(0, dtype=np.int64)
-    return Faced(nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))

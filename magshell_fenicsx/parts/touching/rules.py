@@ -1,4 +1,4 @@
-"""Rules of quadrature on triangles for contact: inside, and with points on an edge and at its corners."""
+"""Rules of quadrature for contact: in triangles, also with points on an edge and at its corners, and on lines."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -33,6 +33,18 @@ def ending_rule(degree: int, turns: int = 0, corner: float = 0.0) -> tuple[Array
     sides = [inside] * (len(t) - 1) + [on_side]
     X = [np.stack([at * (1 - s), at * s], axis=1) for at, (s, _) in zip(t, sides, strict=True)]
     return np.concatenate(X), np.concatenate([by * by_s for by, (_, by_s) in zip(by_t, sides, strict=True)])
+
+
+def rule_on_line(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
+    """Points and weights on [0, 1]: Gauss's, or Radau's and Lobatto's with points next to ends."""
+    from scipy.special import roots_jacobi  # takes long to import
+
+    x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
+    w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
+    end = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
+    x = np.concatenate([[-1 + 2 * BEFORE] * begins, x, [1 - 2 * BEFORE] * ends])
+    w = np.concatenate([[end] * begins, w, [end] * ends])
+    return (x + 1) / 2, w / 2
 
 
 def _with_points(count: int, given: Sequence[float], power: int) -> tuple[Array, Array]:

@@ -166,8 +166,6 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
     context.needs("contact", "a mid-surface", "the same thickness everywhere")
     for step in context.steps:
         _refuse_step(step, context)
-    if context.sections.get("gradients"):
-        raise ValueError("gradients: of shells that may touch each other are not built: leave out contact or gradients")
 
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:

@@ -29,19 +29,11 @@ from magshell_fenicsx.assembly.connected import add_own
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
-from magshell_fenicsx.parts.touching.faces import Faces, slope_of, unknowns
+from magshell_fenicsx.parts.touching.expanded import Expanded
+from magshell_fenicsx.parts.touching.faces import ByGrowth, Faces, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import (
-    SIGNS,
-    Cells,
-    Joined,
-    Longs,
-    Places,
-    inverse,
-    jets,
-    slopes,
-)
+from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places, jets
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
@@ -59,23 +51,6 @@ class Number:
     """A number that a state sets."""
 
     value: float
-
-
-@dataclass(frozen=True)
-class ByGrowth:
-    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
-
-    of: "Touching"
-    order: int = 1
-    amplitude: str | None = None
-
-    def energy(self) -> float:
-        """On this rank's part."""
-        return self.of.by_growth(self.order)
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first one; collective."""
-        self.of.add_by_growth(b, factor)
 
 
 class Touching:
@@ -130,6 +105,7 @@ class Touching:
         self.looks: Sequence[Look] = ()  # see `InSteps`
         self.look: Look | None = None
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
+        self._about: Expanded | None = None
 
     # as a term
 
@@ -141,8 +117,7 @@ class Touching:
     def compile_residual(self) -> None:
         """It has no forms."""
 
-    def compile_tangent(self) -> None:
-        """It has no forms."""
+    compile_tangent = compile_residual
 
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
@@ -240,7 +215,10 @@ class Touching:
                 continue
             after = starts[np.searchsorted(starts, some[-1]) + 1 :]
             part = slice(some[0], after[0] if len(after) else len(keys))
-            H, nodes = self._hessians(at.of(part), weight[part], first[part], second[part])
+            some_at = at.of(part)
+            geometry, placed = self._geometry(some_at), self._facing.placed(self._at)
+            H = hessians(self._cells, some_at, geometry, placed, (weight[part], first[part], second[part]))
+            nodes = geometry[3]
             sums = np.add.reduceat(H, some - some[0], axis=0)
             dofs = unknowns(nodes[some - some[0]], len(self._r0), self._parts)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
@@ -415,6 +393,9 @@ class Touching:
     def _pressed(self) -> tuple[Places, Joined, tuple[Array, Array, Array]]:
         """The places that are pressed at the present state, how they are joined, and the penalty of each joined one
         with its derivatives by the penetration."""
+        if self._about:
+            self._at, self._points = np.array(self._now()), self._about.points
+            return self._about.at(self._facing, self._at, self.stiffness.value, self._h)
         u, grown = self._now(), self._faces.value if self._faces else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
@@ -430,6 +411,15 @@ class Touching:
         places = self._facing.found(u, (1 + SAME) * self._h, points)
         left = self._facing.left_to_edges(points, places, normals)
         return places.of(~left), places.of(left), Joined.of(places.of(~left), BLUR * self._h)
+
+    def pressed(self) -> Expanded:
+        """What is pressed at the present state."""
+        self._pressed()
+        return Expanded.of(self._cells, self._r0, self._h, self._points, self._places, self._joined)
+
+    def expand_about(self, pressed: Expanded) -> None:
+        """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
+        self._about = pressed.on(self._r0)
 
     def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
         """What the Hessian of joined places has besides those of each."""
@@ -455,29 +445,3 @@ class Touching:
         off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
         d = np.linalg.norm(off, axis=1)
         return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
-
-    def _hessians(self, at: Places, weight: Array, first: Array, second: Array) -> tuple[Array, Longs]:
-        """Of the weighted penalty (n, dofs, dofs) by the nodes of both cells."""
-        d, n, beta, nodes = self._geometry(at)
-        half, parts = nodes.shape[1] // 2, self._parts
-        shapes, y = zip(*jets(self._cells.element, at.X, self._facing.placed(self._at)[nodes[:, half:]]), strict=True)
-        normal = np.column_stack([n, 0 * d])[:, None, :parts]
-        off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :parts]
-        A = slopes(off[:, 0], *y[1:])[1]
-        M = np.einsum("nik,nkl,njl->nij", at.free, inverse(at.free, A), at.free)
-        C = np.zeros((len(d), 2, *beta.shape[1:], parts))
-        for a in range(2):
-            across = y[1 + a][:, None] * (SIGNS[:parts] > 0)
-            across -= np.sum(normal * across, axis=2, keepdims=True) * normal
-            C[:, a] = -beta[:, :, None] * across
-            C[:, a, half:] -= shapes[1 + a][:, :, None] * off
-        bent = weight * first / d
-        rows = [slope_of(n, beta, parts)[:, None], (beta[:, :, None] * normal)[:, None], C]
-        left = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
-        middle = np.zeros((len(d), 4, 4))
-        middle[:, 0, 0], middle[:, 1, 1], middle[:, 2:, 2:] = weight * second, bent, bent[:, None, None] * M
-        H = left.transpose(0, 2, 1) @ (middle @ left)
-        both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
-        for i in range(3):
-            H[:, i::parts, i::parts] -= both
-        return H, nodes

@@ -40,6 +40,7 @@ from magshell_fenicsx.simulate.results import Functional, Target, force_unit, fu
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, stage_at
 from magshell_fenicsx.simulate.steps import enclosed, held_by
+from magshell_fenicsx.simulate.touch import refuse_meeting
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
@@ -198,6 +199,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric
     system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
+    refuse_meeting(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})

@@ -70,6 +70,8 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         If no result of the scene depends on it.
     """
     scene = adjoint.scene
+    if name in ("thickness", "deviation") and scene.model.touchings:
+        raise CaseError(f"{name}: no gradient by this field with contact between shells, whose gap it changes")
     other = _with_field(adjoint, name)
     if other is not scene:
         return by_field(_carried(adjoint, other), name)

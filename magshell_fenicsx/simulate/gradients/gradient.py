@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -116,8 +116,12 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
 
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:
-    """Take the penalties of bodies in another scene on the same mesh as polynomials about a state of the first one."""
+    """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
     at = scene.model.system.at(state)
+    of_one: Sequence[Any] = scene.model.touchings
+    of_other: Sequence[Any] = other.model.touchings
+    for touching, same in zip(of_one, of_other, strict=True):
+        same.expand_about(at.of(touching.pressed))
     for name, (pressing, _) in scene.model.contacts.items():
         other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
 
@@ -206,8 +210,6 @@ def gradient(
 
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
     """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number` for `others`."""
-    if adjoint.scene.model.touchings:
-        raise CaseError(f"{by}: of shells that may touch each other gradients are not built")
     size = adjoint.size
     if by in FIELDS:
         of_field = by_field(adjoint, by)

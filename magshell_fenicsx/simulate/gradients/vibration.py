@@ -44,7 +44,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import pressing, rigid
+from magshell_fenicsx.simulate.touch import pressing, refuse_meeting, rigid
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
@@ -190,6 +190,7 @@ def adjoints_of_vibrations(
             f"{of}: has no gradient where a body touches the shell ({bodies[0].body}): where it touches changes within "
             "far less than a difference takes; take differences of runs"
         )
+    refuse_meeting(scene, state, of)
     held = held_at(scene, record, state, hold)
     kinds = vibrations(scene, state, of, beside=beside, most=most)
     made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in kinds]

@@ -1,0 +1,162 @@
+"""Gradients of shells that press on each other against differences of runs that are solved again."""
+
+import json
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command import magshell
+from numpy.typing import NDArray
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.gradients.gradient import gradient
+from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.results import functional
+
+Array = NDArray[np.float64]
+h, GAP = 0.02, 1.001 * (0.02 + 0.025) / 2  # between mid-surfaces of 1 and 1.25 h
+STEP = 1e-4  # of a number
+CAP = {"geometry": "cap", "radius": 1, "polar": 30, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+LOWER = {"shell": CAP, "boundary": {"rim": "clamped"}, "points": {"top": [0, 0, 1]}}
+CAPS: dict[str, Any] = {
+    "shells": {
+        "lower": LOWER,
+        "upper": {
+            **LOWER, "shell": CAP | {"youngs_modulus": 2.0, "thickness": 0.025},
+            "place": {"position": [0, 0, 2 + GAP], "axis": {"polar": 180}},
+        },
+    },
+    "contact": [["upper", "lower"]],
+    "loading": {
+        "kind": "edge", "name": "w", "control": "load", "factor": 0.5, "points": 1,
+        "moves": [{"supports": ["upper.rim"], "translation": [0, 0, -2 * h]}],
+    },
+}  # fmt: skip
+ARCH = {
+    "geometry": "cylinder", "radius": 1, "length": 0.12, "azimuth": [60, 120], "thickness": h, "youngs_modulus": 1,
+    "poisson_ratio": 0.3,
+}  # fmt: skip
+ARCHES: dict[str, Any] = {
+    "shells": {
+        "lower": {"shell": ARCH, "boundary": {"left": "clamped", "right": "clamped"}, "points": {"top": [0, 1, 0.06]}},
+        "upper": {
+            "shell": ARCH | {"youngs_modulus": 2.0, "thickness": 0.025},
+            "boundary": {"left": "clamped", "right": "clamped"}, "remanent": {"polar": 90, "azimuth": 90},
+            "place": {"position": [0, 2 + GAP, 0], "turn": 180},
+        },
+    },
+    "contact": [["upper", "lower"]],
+    "magnetic": {"lambda_m": 5e-3, "applied": {"polar": 90, "azimuth": -90}},
+    "mesh": {"size": 0.12, "degree": 2},
+    "loading": {"kind": "field", "points": 1},
+}  # fmt: skip
+THICKNESS, MODULUS = "shells.upper.shell.thickness", "shells.lower.shell.youngs_modulus"
+
+
+def case(data: dict[str, Any], values: Mapping[str, float]) -> Case:
+    """A case with other numbers."""
+    data = deepcopy(data)
+    for key, value in values.items():
+        *sections, name = key.split(".")
+        at = data
+        for section in sections:
+            at = at[section]
+        at[name] = value
+    return Case.from_source(data)
+
+
+def solved(scene: Scene) -> Record:
+    *_, last = follow(scene)
+    return last
+
+
+def by_difference(scene: Scene, data: dict[str, Any], key: str, value: float, of: str) -> float:
+    """Of whole runs with other numbers."""
+
+    def run(change: float) -> float:
+        other = Scene(on_mesh_of(scene, case(data, {key: value * (1 + change)}).problem()))
+        return functional(other, solved(other).point.state, of).value
+
+    return (run(STEP) - run(-STEP)) / (2 * STEP * value)
+
+
+def test_on_meridians() -> None:
+    """By the thickness of one shell, on which the gap and the penalty depend, and by a modulus; frequencies have none.
+
+    One factorisation for all.
+    """
+    scene = Scene(case(CAPS, {}))
+    last = solved(scene)
+    assert scene.model.axisymmetric
+    assert scene.observe(last.point.state)["contact_force"] > 1
+    before = scene.newton.factorisation.count
+    found = gradient(scene, last, of="lower_top_uz", by=[THICKNESS, MODULUS])
+    assert scene.newton.factorisation.count <= before + 1
+    for key, value in ((THICKNESS, 0.025), (MODULUS, 1.0)):
+        assert found[key] == pytest.approx(by_difference(scene, CAPS, key, value, "lower_top_uz"), rel=1e-6), key
+    with pytest.raises(CaseError, match=r"omega2_1: has no gradient where shells touch \(upper and lower\)"):
+        gradient(scene, last, of="omega2_1", by="w")
+
+
+def with_remanence(scene: Scene, along: Callable[[Array], Array], c: float) -> Scene:
+    """The scene whose remanence has a further part."""
+    loads = scene.problem.loads
+    assert loads.magnetic
+
+    def remanent(r0: Array, n0: Array) -> Array:
+        return np.asarray(np.array([0.0, 1.0, 0.0]) * np.cos(r0[..., :1]) + c * along(r0))
+
+    magnetic = replace(loads.magnetic, remanent=remanent)
+    return Scene(replace(scene.problem, loads=replace(loads, magnetic=magnetic)))
+
+
+def smooth(x: Array) -> Array:
+    """As halves are in x."""
+    even = np.cos(3 * x[..., 0]) - 0.5 * x[..., 1]
+    return np.stack([np.sin(2 * x[..., 0]), even, 0 * even], axis=-1)
+
+
+@pytest.mark.slow
+def test_half_of_two_arches() -> None:
+    """By a thickness, the field and the remanence: displacements of the shell that is pressed, and the energy."""
+    scene = Scene(case(ARCHES, {}))
+    last = solved(scene)
+    assert scene.problem.half
+    assert scene.observe(last.point.state)["contact_force"] > 0.01
+    for of in ("lower_top_uy", "energy"):
+        found = gradient(scene, last, of=of, by=[THICKNESS, "lambda_m"])
+        for key, name, value in ((THICKNESS, THICKNESS, 0.025), ("magnetic.lambda_m", "lambda_m", 5e-3)):
+            assert found[name] == pytest.approx(by_difference(scene, ARCHES, key, value, of), rel=1e-6), (of, name)
+    magnet = with_remanence(scene, smooth, 0.0)
+    by_field = gradient(magnet, solved(magnet), of="lower_top_uy", by="remanence")["remanence"]
+    assert isinstance(by_field, FieldGradient)
+    ahead, back = (with_remanence(scene, smooth, way * 1e-3) for way in (1, -1))
+    values = [functional(each, solved(each).point.state, "lower_top_uy").value for each in (ahead, back)]
+    expected = (values[0] - values[1]) / 2e-3
+    assert by_field.along(smooth(by_field.places)) == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(CaseError, match="deviation: no gradient by this field with contact between shells"):
+        gradient(scene, last, of="energy", by="deviation")
+
+
+@pytest.mark.slow
+def test_ranks(tmp_path: Path) -> None:
+    """A run's section `gradients` on 1 and 2 ranks."""
+    asked = {"gradients": {"of": ["lower_top_uy"], "by": [THICKNESS, "lambda_m"]}, "symmetry": "none"}
+    (tmp_path / "arches.yaml").write_text(yaml.safe_dump(ARCHES | asked))
+    found = list[dict[str, float]]()
+    for ranks in (1, 2):
+        out = tmp_path / str(ranks)
+        done = magshell("run", tmp_path / "arches.yaml", "--no-pictures", "--out", out, ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        summary = json.loads((out / "summary.json").read_text())
+        found.append(summary["gradients"]["lower_top_uy"]["numbers"])
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
