@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 DEEP = 2e-3  # of the thickness: how far before and past the first contact the guesses of two steps lead
 CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
+END = 1 - 1e-9  # of a way: what sets in at its end does so on it
 
 
 def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> Ahead:
@@ -62,8 +63,10 @@ def _onset(touching: Touching, h: float, u: Array, v: Array) -> tuple[float, boo
         gap = touching.gap(u + part * (v - u))
         if gap < aim - deep:
             high, at_high = part, gap
-        elif gap <= aim + deep or part == 1.0:
-            return part, sets_in
+        elif gap <= aim + deep:
+            return min(part, END), sets_in
+        elif part == 1.0:
+            return 1.0, False
         else:
             low, at_low = part, gap
     return (high if sets_in else low) or low, sets_in
