@@ -46,7 +46,7 @@ def way_to_touch(here: State, guess: State) -> Ahead:
 
 
 def walked(load: float, first: float) -> list[tuple[Label, Point]]:
-    newton = BorderedNewton(stop(), NewtonOptions(fresh=0.0, patience=7, kinks=True))
+    newton = BorderedNewton(stop(), NewtonOptions(fresh=0.0, patience=7, stiffnesses={"stop": 1.0}))
     path = Path(newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch)
     return list(Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("target", [load])))
 

@@ -115,7 +115,7 @@ def with_remanence(scene: Scene, along: Callable[[Array], Array], c: float) -> S
     def remanent(r0: Array, n0: Array) -> Array:
         return np.asarray(np.array([0.0, 1.0, 0.0]) * np.cos(r0[..., :1]) + c * along(r0))
 
-    magnetic = replace(loads.magnetic, remanent=remanent)
+    magnetic = replace(loads.magnetic, remanent=remanent, patches=None)
     return Scene(replace(scene.problem, loads=replace(loads, magnetic=magnetic)))
 
 
