@@ -12,6 +12,7 @@ from magshell_fenicsx.parts.magnetism.coulomb import Charged
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
+from magshell_fenicsx.parts.magnetism.turned import Turning
 
 Array = NDArray[np.float64]
 H, SIDES = 0.02, 5
@@ -87,7 +88,8 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     stiffness = Stiffness(beside, 1.0, numbers, numbers, np.eye(3)[None])
     _, gradient = charges.evaluate(nodes, own, stiffness)
     cells = Cells(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
-    acting = ActingOnEachOther(stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0)
+    kept, turning = np.ones(len(stiffness.columns), dtype=bool), Turning(MPI.COMM_SELF)
+    acting = ActingOnEachOther(stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning)
     product = acting.stored @ v.ravel() + acting.times_others(v.reshape(-1, 1))[:, 0]
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     moved = [(w / step, charges.evaluate(nodes + k * step * v, own)) for k, w in ways]
