@@ -1,6 +1,6 @@
 """Where shells that may touch are nearest to each other undeformed: their elements are smaller there."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 FINE = 0.5  # of sqrt(R h): cells where shells meet
 AROUND, APART = 1.0, 2.0  # of sqrt(R h): how far from there, and how far from each other places are one
 ALIKE = 0.5  # of the thickness: places that are so much farther from each other may meet as well
+FAR = 20.0  # thicknesses: shells that are farther from each other may meet anywhere, or nowhere
+EXACT = 1e-12  # change of the square of the distance at which a search ends
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ def meetings(
     places: Mapping[str, Array],
     thickness: Mapping[str, float],
     apart: Mapping[str, float],
+    charted: "Mapping[str, Charted]",
 ) -> dict[str, list[Array]]:
     """Name of a shell -> places (3,) where others that it may touch are nearest, if that is one place and no area.
 
@@ -47,6 +50,8 @@ def meetings(
         Name -> places (n, 3) all over it.
     thickness, apart
         Name -> its thickness, and how far from each other places are one; of all in the same length.
+    charted
+        Name -> its chart; without one its places are those that are given.
     """
     names = list(places)
     every = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
@@ -56,9 +61,42 @@ def meetings(
             continue
         for one, other in ((a, b), (b, a)):
             x = places[one]
-            away = scipy.spatial.KDTree(places[other]).query(x)[0]
-            nearest = x[np.argmin(away)]
+            away, which = scipy.spatial.KDTree(places[other]).query(x)
+            first = int(np.argmin(away))
             alike = x[away < away.min() + ALIKE * thickness[one]]
-            if np.linalg.norm(alike - nearest, axis=1).max() < apart[one]:
-                found[one].append(nearest)
+            if np.linalg.norm(alike - x[first], axis=1).max() >= apart[one]:
+                continue
+            ends = x[first], places[other][which[first]]
+            if one in charted and other in charted:
+                ends = _nearest(*ends, charted[one], charted[other])
+            if np.linalg.norm(ends[0] - ends[1]) < FAR * thickness[one]:
+                found[one].append(ends[0])
     return found
+
+
+@dataclass(frozen=True)
+class Charted:
+    """A shell in the frame of all: charts (2,) of places (3,), and the other way round."""
+
+    outline: Outline
+    place: Callable[[Array], Array]
+    own: Callable[[Array], Array]
+
+    def chart(self, x: Array) -> Array:
+        """That of a place."""
+        return self.outline.inverse(self.own(x))
+
+    def at(self, chart: Array) -> Array:
+        """The place of a chart, or of the nearest one that the shell has."""
+        return self.place(self.outline.embedding(self.outline.within(chart)[None])[0])
+
+
+def _nearest(x: Array, y: Array, of_x: Charted, of_y: Charted) -> tuple[Array, Array]:
+    """The places of two surfaces, near x and y, that are nearest to each other."""
+
+    def apart(charts: Array) -> Array:
+        return of_x.at(charts[:2]) - of_y.at(charts[2:])
+
+    start = np.concatenate([of_x.chart(x), of_y.chart(y)])
+    found = scipy.optimize.least_squares(apart, start, ftol=EXACT, xtol=EXACT, gtol=EXACT).x
+    return of_x.at(found[:2]), of_y.at(found[2:])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.meeting import APART, meetings
+from magshell_fenicsx.case.meeting import APART, Charted, meetings
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member
 from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, SECOND_CUT, Mirror, Sector, rotation
@@ -149,14 +149,17 @@ class Members:
     @cached_property
     def _met(self) -> Mapping[str, Sequence[Array]]:
         """Name of a shell -> places (3,) in its own frame where others that it may touch are nearest."""
-        several, places, thickness, apart = self._several, dict[str, Array](), dict[str, float](), dict[str, float]()
+        several, places, near = self._several, dict[str, Array](), dict[str, Charted]()
+        thickness, apart = dict[str, float](), dict[str, float]()
         if not several.pairs:
             return {part.name: [] for part in several.parts}
         for part, ground in zip(several.parts, self._grounds, strict=True):
             h, place = 1 / part.case.shell.R_over_h, several.place(part)
             places[part.name] = place(ground.perfect.sample())
             thickness[part.name], apart[part.name] = h * place.scale, APART * sqrt(h) * place.scale
-        found = meetings(several.pairs, places, thickness, apart)
+            if ground.perfect.charts() is not None:
+                near[part.name] = Charted(ground.perfect, place, place.own)
+        found = meetings(several.pairs, places, thickness, apart, near)
         return {part.name: [several.place(part).own(x) for x in found[part.name]] for part in several.parts}
 
     @property

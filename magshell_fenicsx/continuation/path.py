@@ -292,7 +292,7 @@ class Path:
         tried, ahead = self._try(plan.s, plan.seen), plan.ahead
         if ahead.part < 1 and not ahead.behind:
             return self._reached(here, tried)
-        sharp = ahead.part < 1 and self.control == "arc" and not isinstance(tried, Point)
+        sharp = ahead.behind and self.control == "arc" and not isinstance(tried, Point)
         return self._try(plan.s, [self._beside(here)]) if sharp else tried
 
     def _look_again(self, course: Course, far: Far, sense: float) -> bool:

@@ -17,7 +17,6 @@ Array = NDArray[np.float64]
 DEEP = 2e-3  # of the thickness: how far before and past the first contact the guesses of two steps lead
 CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
-END = 1 - 1e-9  # of a way: what sets in at its end does so on it
 
 
 def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> Ahead:
@@ -37,7 +36,8 @@ def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, gue
         if here_at.of(each.penetration):
             lets_go |= not guess_at.of(each.penetration)
         else:
-            meets = min(meets, _onset(each, each.pair.thickness * scene.problem.material.h, u, v))
+            at = _onset(each, each.pair.thickness * scene.problem.material.h, u, v)
+            meets = min(meets, at, key=lambda each: (each[0], not each[1]))
     return Ahead(*meets, lets_go)
 
 
@@ -64,7 +64,7 @@ def _onset(touching: Touching, h: float, u: Array, v: Array) -> tuple[float, boo
         if gap < aim - deep:
             high, at_high = part, gap
         elif gap <= aim + deep:
-            return min(part, END), sets_in
+            return part, sets_in
         elif part == 1.0:
             return 1.0, False
         else:

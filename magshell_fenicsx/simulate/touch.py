@@ -29,7 +29,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
-IMPACT = 10.0  # times the bound: a penetration that lasts for a moment
+IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
@@ -230,10 +230,10 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
     for pair, deep in between(scene, state):
         bound = pair.bound * (IMPACT if moving else 1.0)
         if deep > bound * h:
-            raise Stopped(
-                f"the penetration between {pair.words} is {deep / h:.3g} h, more than {bound:g} h even with the "
-                "stiffest penalty: take smaller elements where they touch"
-            )
+            what = f"the penetration between {pair.words} is {deep / h:.3g} h, more than {bound:g} h"
+            if moving:
+                raise Stopped(f"{what}: they hit each other too fast for the penalty")
+            raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")
 
 
 def pressing(scene: Scene, state: State) -> list[Contact]:

@@ -258,7 +258,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     dt, most = steps.first, integrator.kinetic(now)
     total = most + system.stored(now.u, now.mu)
     outputs = [duration * i / load.points for i in range(1, load.points + 1)]
-    watched, ended = _watched(scene, load.event, state), ""
+    watched, ended, size = _watched(scene, load.event, state), "", scene.model.multiplicity
 
     def crossed(before: Motion, now: Motion) -> bool:
         return bool(watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before))
@@ -280,11 +280,10 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         most = max(most, kinetic)
         clock = {
             "time": now.t * (problem.time_unit or 1.0),
-            "kinetic": scene.model.multiplicity * kinetic,
-            "dissipated": scene.model.multiplicity * now.dissipated,
-            "work": scene.model.multiplicity * now.work,
-            "imbalance": scene.model.multiplicity
-            * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
+            "kinetic": size * kinetic,
+            "dissipated": size * now.dissipated,
+            "work": size * now.work,
+            "imbalance": size * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
         }
         excluded = scene.model.excluded_modes
         unseen = sum(excluded.counts(point.state)) if excluded else 0
@@ -295,7 +294,11 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             ended = "duration"
         yield Record("target" if ended else "step", "time", point, excluded_pivots=unseen, clock=clock)
         if rest:
-            still = {**clock, "kinetic": 0.0}
+            pull = system.coordinates  # constant loads do work on the way to rest
+            moved = {n: system.potential(rest.u, rest.mu, n) - q for n, q in now.potentials.items() if n not in pull}
+            work = now.work - sum(now.mu[name] * change for name, change in moved.items())
+            lacks = system.stored(rest.u, rest.mu) + now.dissipated - work - total
+            still = {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * lacks}
             yield Record("target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still)
             return rest
         if ended:

@@ -7,11 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.meeting import FINE, meetings
+from magshell_fenicsx.case.meeting import FINE, Charted, meetings
+from magshell_fenicsx.shape.outline import outline
 
 Array = NDArray[np.float64]
 h = 0.02
 RIM = {"boundary": {"rim": "clamped"}}
+CAP = {"geometry": "cap", "polar": 60, "radius": 1, "thickness": h, "poisson_ratio": 0.3}
 PRESSED = {"kind": "pressure", "pressure": 0.1, "until": "target", "points": 1}
 
 
@@ -44,6 +46,27 @@ def test_faces_that_are_parallel_have_no_place_where_they_meet() -> None:
     x = np.linspace(0, 1, 41)
     flat, inclined = np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x, 0.1 + x])
     thickness, apart = {"a": 0.1, "b": 0.1}, {"a": 0.2, "b": 0.2}
-    found = meetings([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart)
+    found = meetings([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart, {})
     assert [each.tolist() for each in found["b"]] == [[0, 0, 0.1]]
-    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart) == {"a": [], "b": []}
+    far = meetings([["a", "b"]], {"a": flat, "b": inclined + np.array([0, 0, 3])}, thickness, apart, {})
+    assert far == {"a": [], "b": []}
+    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart, {}) == {"a": [], "b": []}
+
+
+@pytest.mark.parametrize("off", [0.0, 0.17])
+def test_the_place_is_that_of_spheres(off: float) -> None:
+    """Of two caps, one beside the axis of the other, on the line between their centres; 1e-3."""
+    cap = outline(Case.from_source({"shell": CAP, "loading": PRESSED, **RIM}).shell)
+    centre = np.array([off, 0.0, np.sqrt(2.03**2 - off**2)])
+
+    def above(x: Array) -> Array:
+        return x * [1, -1, -1] + centre
+
+    def under(x: Array) -> Array:
+        return (x - centre) * [1, -1, -1]
+
+    places = {"a": cap.sample(), "b": above(cap.sample())}
+    charted = {"a": Charted(cap, lambda x: x, lambda x: x), "b": Charted(cap, above, under)}
+    found = meetings([["a", "b"]], places, dict.fromkeys("ab", 0.02), dict.fromkeys("ab", 0.3), charted)
+    assert found["a"][0] == pytest.approx(centre / 2.03, abs=1e-3)
+    assert found["b"][0] == pytest.approx(centre - centre / 2.03, abs=1e-3)
