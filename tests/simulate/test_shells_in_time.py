@@ -38,8 +38,8 @@ def found_of(base: dict[str, Any]) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("symmetry", MESHES)
 @pytest.mark.parametrize("ends", [(0.2, 0.29), (0.29, 0.24), (0.29, 0.2902), (0.24, 0.3)])
 def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(symmetry: str, ends: tuple[float, float]) -> None:
-    """Where contact sets in, ceases and goes on: 1e-9 of the larger energy; differences of the force: 1e-3 of its
-    tangent, of which the geometric part of a kink is left out, and nearer where that is small."""
+    """Where contact sets in, ceases and goes on: 1e-9 of the larger energy. Differences of the force are its tangent
+    within 1e-3, as the tangent leaves out how factors at kinks change with the direction of the way."""
     steps = {"loading": [{"kind": "time", "duration": 1.0, "points": 1}], "symmetry": symmetry}
     scene = Scene(Case.from_source(Source("test", DISCS | steps | {"mesh": MESHES[symmetry]})))
     (contact,), h = scene.model.touchings, scene.model.material.h
