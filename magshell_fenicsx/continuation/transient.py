@@ -362,11 +362,10 @@ class Integrator:
         a, v = self._rates(now, u, dt)
         mu = self._advance(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
         after, mean = Motion(t, u, v, a, mu), dict[str, float]()
-        if self.averaged and self._driven & self.averaged.names:
-            part = 1 - rule.alpha_f
+        if self.averaged:
+            moving = self._driven & (self.averaged.names | (self.ground.names if self.ground else frozenset()))
             self._average(now, u, y, dt)
-            place = now.u + part * (u - now.u), self._at(now, y, part, dt)
-            mean = {name: self.system.potential(*place, name) for name in self._driven & self.averaged.names}
+            mean = {name: self._mean(name, now, after, y, dt) for name in moving}
             self.averaged.present()
         potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
         work = sum(self._work(name, now, mu, potentials, mean.get(name)) for name in potentials)
@@ -410,6 +409,21 @@ class Integrator:
             for name in self._driven & self.ground.names:
                 potentials[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
         return potentials
+
+    def _mean(self, name: str, now: Motion, after: Motion, y: Array, dt: float) -> float:
+        """The force on what moves beside a contact in a step, as the step has it; of supports with that of inertia."""
+        ground, m, f, force = self.ground, self.rule.alpha_m, self.rule.alpha_f, 0.0
+        for part, weight in self.rule.forces:
+            place = now.u + part * (after.u - now.u), self._at(now, y, part, dt)
+            force += weight * self.system.potential(*place, name)
+        if ground and name in ground.names:
+            ends = (after, after.t, True), (now, now.t, False)
+            a, before = (each.a + ground.acceleration(t, side) for each, t, side in ends)
+            v, old = (each.v + ground.velocity(t, side) for each, t, side in ends)
+            pull = (1 - m) * a + m * before + self.drag * ((1 - f) * v + f * old)
+            along = ground.along(self._at(now, y, 1 - f, dt), name)
+            force += dot(self.system.comm, ground.times(pull), along)
+        return force
 
     def _work(
         self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float], mean: float | None

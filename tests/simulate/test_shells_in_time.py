@@ -83,3 +83,21 @@ def test_two_plates_that_clap_conserve_energy(symmetry: str) -> None:
     assert max(row["contact_force"] for row in found) > 0
     for row in found[1:]:
         assert abs(row["imbalance"]) < 1e-6 * (row["kinetic"] + row["stored"])
+
+
+def test_the_work_of_a_rim_that_meets_the_other_plate() -> None:
+    """A small plate is driven down by its rim onto the large one: the work of its mean force closes the balance."""
+    small = {
+        "shell": DISC | {"radius": "20 mm"},
+        **{key: DISCS["shells"]["high"][key] for key in ("boundary", "place")},
+    }
+    moves = [{"supports": ["high.rim"], "translation": ["0 mm", "0 mm", "-1 mm"]}]
+    driven = {"kind": "edge", "name": "down", "moves": moves, "points": 1, "factor": 1e-4}
+    history = {"history": {"down": "0.0001 + (t/0.02)**2"}, "duration": 0.018, "points": 9}
+    moving = {key: value for key, value in THROWN.items() if key != "velocity"} | history
+    shells = DISCS["shells"] | {"high": small}
+    found = found_of(
+        DISCS | {"shells": shells, "loading": [driven, moving], "symmetry": "half", "mesh": MESHES["half"]}
+    )
+    assert max(row["contact_force"] for row in found) > 0
+    assert abs(found[-1]["imbalance"]) < 1e-6 * found[-1]["work"]
