@@ -101,3 +101,10 @@ def test_the_work_of_a_rim_that_meets_the_other_plate() -> None:
     )
     assert max(row["contact_force"] for row in found) > 0
     assert abs(found[-1]["imbalance"]) < 1e-6 * found[-1]["work"]
+
+
+def test_a_plane_with_a_position_beside_several_shells() -> None:
+    """It needs no `at`: its front is where it is given."""
+    floor = {"kind": "plane", "position": ["0 mm", "0 mm", "-0.7 mm"], "direction": [0, 0, 1]}
+    (contact,) = Case.from_source(DISCS | {"loading": [THROWN], "bodies": {"floor": floor}}).problem().loads.contacts
+    assert contact.front == pytest.approx([0, 0, -0.7 / 50], abs=1e-12)

@@ -63,7 +63,11 @@ def contacts(
 
 def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> Contact:
     key, h, Q = f"bodies.{name}", ground.h, ground.Q
-    place, _ = located(section.at, ground, key)
+    if ground.geometry == "mesh" and section.position is not None and "at" not in section.model_fields_set:
+        places = ground.perfect.sample()
+        place = places[np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()]
+    else:
+        place, _ = located(section.at, ground, key)
     chart = ground.perfect.inverse(place)
     normal = ground.perfect.normal_near(chart)
     start = place if len(chart) == 3 else ground.drawn.embedding(chart[None])[0]
