@@ -362,8 +362,8 @@ class Integrator:
         a, v = self._rates(now, u, dt)
         mu = self._advance(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
         after, mean = Motion(t, u, v, a, mu), dict[str, float]()
-        if self.averaged:
-            moving = self._driven & (self.averaged.names | (self.ground.names if self.ground else frozenset()))
+        beside = self.averaged.names | (self.ground.names if self.ground else frozenset()) if self.averaged else ()
+        if self.averaged and (moving := self._driven.intersection(beside)):
             self._average(now, u, y, dt)
             mean = {name: self._mean(name, now, after, y, dt) for name in moving}
             self.averaged.present()

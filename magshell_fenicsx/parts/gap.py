@@ -82,6 +82,13 @@ def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
     return value, first, second
 
 
+def expanded(s: Array, about: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
+    """Its Taylor polynomial of second order about other penetrations, and the derivatives of that."""
+    value, first, second = penalty(about, k, soft)
+    more = s - about
+    return value + more * (first + more / 2 * second), first + more * second, second
+
+
 def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:
     """(psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1."""
     (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft), penalty(s1, k, soft)

@@ -21,7 +21,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
-from magshell_fenicsx.parts.gap import SOFT, Thinning, mean_pressure, penalty, thinned
+from magshell_fenicsx.parts.gap import SOFT, Thinning, expanded, mean_pressure, penalty, thinned
 
 Array = NDArray[np.float64]
 PAIRS = np.triu_indices(3)
@@ -282,10 +282,8 @@ class Pressing:
         about = self._about[0] if self._about else gap
         pressed = about < 0
         k = float(self.stiffness.value)
-        value, first, second = (a[:, None] for a in penalty(-about[pressed], k, SOFT * self._h))
-        if self._about:
-            more = (about - gap)[pressed, None]
-            value, first = value + more * (first + more / 2 * second), first + more * second
+        of_depth = expanded(-gap[pressed], -about[pressed], k, SOFT * self._h)
+        value, first, second = (a[:, None] for a in of_depth)
         return _Expanded(pressed, value, first, second, n[pressed], N[pressed])
 
     def _polynomials(self) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.facing import BLUR, Facing
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Places, distances, followed, jets
 from magshell_fenicsx.parts.touching.segments import Points
@@ -64,14 +64,7 @@ class Expanded:
         mean = np.bincount(joined.group, joined.weight * change, len(joined.first))
         weight = joined.weight * (1 - (change - mean[joined.group]) / (BLUR * h))
         joined = replace(joined, distance=joined.distance + mean, weight=weight)
-        return replace(at, X=X, distance=distance), joined, expanded(h - joined.distance, self.depth, k, h)
-
-
-def expanded(depth: Array, about: Array, k: float, h: float) -> Penalty:
-    """The penalty's Taylor polynomial of second order about other penetrations, and its derivatives."""
-    value, first, second = penalty(about, k, SOFT * h)
-    more = depth - about
-    return value + more * (first + more / 2 * second), first + more * second, second
+        return replace(at, X=X, distance=distance), joined, expanded(h - joined.distance, self.depth, k, SOFT * h)
 
 
 def _area(cells: Cells, r0: Array, points: Points) -> Array:

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
-from magshell_fenicsx.parts.touching.expanded import expanded
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
 from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, FOLLOWING, ROUNDS
@@ -227,7 +226,7 @@ class MeridianTouching:
 
     def _penalty(self, at: Faced) -> tuple[Array, Array, Array]:
         if self._about:
-            return expanded(self._h - at.distance, self._about[1], self.stiffness.value, self._h)
+            return expanded(self._h - at.distance, self._about[1], self.stiffness.value, SOFT * self._h)
         pressed = penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
         return self.look.of(at.point, pressed) if self.look else pressed
 
