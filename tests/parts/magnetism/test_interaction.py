@@ -550,7 +550,7 @@ def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
 def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, gap: float) -> None:
     """A strip leans on another one just behind its end: forces and tangent are slopes of the energy, by differences.
 
-    Shorter by 0.1 h, it would be in the other one if it went on. The gap (h) is that of its end.
+    It ends 0.1 h before the other one begins: its face, continued, would cross that one's. The gap (h) is at its end.
     """
     h = 0.3
     rooted_strips(tmp_path / "strips.msh")
