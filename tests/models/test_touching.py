@@ -234,10 +234,6 @@ def test_a_step_that_passes_through() -> None:
     [
         ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
         ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
-        (
-            {"shell": {**RING["shell"], "thickness_factor": "1 + x/9"}},
-            "contact: needs the same thickness everywhere; leave out shell.thickness_factor",
-        ),
         ({"loading": {"kind": "pressure", "until": "bifurcation", "then": "follow"}}, "then: follow: with contact"),
         ({"loading": {"kind": "pressure", "search": {}}}, "search: with contact between shells"),
     ],

@@ -1,11 +1,12 @@
-"""How far faces of rubber are from the mid-surface: half the deformed thickness, a continuous function of the place.
+"""How far faces are from a mid-surface whose thickness varies or changes: half of it, continuous from cell to cell.
 
 At each node it is the undeformed volume per deformed area of the cells around, and between nodes their polynomial:
 
     H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell gets thinner as it stretches, J0 where it does not,
 
-with J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the natural volume, a polynomial of the
-amplitude "natural_stretch". The derivatives by the displacement and by this are exact.
+with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the
+natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by the displacement and by this are
+exact.
 """
 
 from dataclasses import dataclass
@@ -87,6 +88,8 @@ class Faces:
     ----------
     grown
         The same.
+    undeformed
+        Half the undeformed thickness (nodes,) over R, before anything grows.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class Faces:
         J0 = self._areas(r0, slice(None))
         self._volumes = h / 2 * np.array([self._sum(slice(None), each * J0) for each in thickness])
         self._stays = self._sum(~thins, J0[~thins])
+        self.undeformed = np.asarray(self._volumes[0] / self._sum(slice(None), J0))
 
     @property
     def value(self) -> float:
@@ -121,6 +125,8 @@ class Faces:
 
     def slope(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
+        if not len(self._thin):
+            return np.zeros_like(u)
         return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(-1, 3))
 
     def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
@@ -161,6 +167,9 @@ class Faces:
         """
         rows, columns, values = entries
         size, count = 4 * len(f), 3 * len(f)
+        if not len(self._thin):  # H stays
+            of_places = (rows < count) & (columns < count)
+            return rows[of_places], columns[of_places], values[of_places]
         which = np.zeros(size, dtype=bool)
         which[rows] = True
         by_u = scipy.sparse.vstack([scipy.sparse.eye_array(count), self.jacobian(u, which[count:])]).tocsr()
@@ -170,6 +179,8 @@ class Faces:
 
     def around(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
         """Pairs of nodes that act on each other, where places and thickness at pairs of nodes do."""
+        if not len(self._thin):
+            return rows, columns
         nodes, count = self._places, len(self._r0)
         has = np.repeat(np.arange(len(nodes)), nodes.shape[1])
         cells = scipy.sparse.coo_array((np.ones(nodes.size), (has, nodes.ravel())), (len(nodes), count)).tocsr()

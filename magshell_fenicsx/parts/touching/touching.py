@@ -12,8 +12,8 @@ With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distanc
 where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
 Springer 2006, sec. 4.1 and 9.
 
-Shells that get thinner have half the thickness H at nodes as a fourth unknown: d is then the least of |x - y| - H(y),
-less H(x), plus h, so that |x - y| need not be the least. H follows from the displacement (`Faces`).
+Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of |x - y| - H(y), less H(x),
+plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -63,13 +63,15 @@ class Touching:
     allowed
         Whether points of cells (n,) may touch cells (n,).
     h
-        Thickness over R.
+        Thickness over R: that of the penalty and of the search where it varies.
     r0, u
         All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
     own, local
         Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
+    nodes
+        Of both parts.
     faces
-        How far they are from the mid-surface where the thickness changes with the state; None where it does not.
+        How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
     """
 
     amplitude = None
@@ -87,6 +89,7 @@ class Touching:
         own: tuple[int, int],
         local: tuple[int, int],
         comm: MPI.Comm,
+        nodes: Longs,
         faces: Faces | None = None,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
@@ -97,6 +100,8 @@ class Touching:
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
+        self._touched = nodes
+        self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
@@ -147,7 +152,8 @@ class Touching:
         """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
         self._pressed()
         number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
-        at = self._facing.places_in(self._points, u, self._facing.placed(u), (1 + AHEAD) * self._h)
+        ahead = self._h + AHEAD * (self._far - self._h) / (REACH - 1)
+        at = self._facing.places_in(self._points, u, self._facing.placed(u), ahead)
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
@@ -243,7 +249,7 @@ class Touching:
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self._facing.found(self._now(), REACH * self._h, self._points)
+        places = self._facing.found(self._now(), self._far, self._points)
         least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
         return least - self._h if np.isfinite(least) else np.nan
 
@@ -251,6 +257,12 @@ class Touching:
         """The largest, over R; 0 where nothing touches; collective."""
         at, *_ = self._pressed()
         return float(self._comm.allreduce(float((self._h - at.distance).max(initial=0.0)), MPI.MAX))
+
+    def depth(self) -> float:
+        """The same over the undeformed thickness there."""
+        at, *_ = self._pressed()
+        deep = (self._h - at.distance) / self._facing.thickness(self._points, at) if len(at.point) else at.distance
+        return float(self._comm.allreduce(float(deep.max(initial=0.0)), MPI.MAX))
 
     def deepest(self) -> tuple[float, Array]:
         """The largest penetration over R, and its place (3,); collective."""
@@ -270,19 +282,24 @@ class Touching:
         """
         at, joined, (_, first, _) = self._pressed()
         points, (start, count) = self._points, self._local
-        weight, p, gap = np.ones(count), np.zeros(count), np.full(count, (REACH - 1) * self._h)
+        weight, p, gap = np.ones(count), np.zeros(count), np.full(count, self._far - self._h)
         np.add.at(weight, points.cell - start, points.weight)
         weight[: len(np.unique(points.cell))] -= 1.0
         pressed = at.point[joined.first]
         np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
-        near = self._facing.found(self._now(), REACH * self._h, points)
+        near = self._facing.found(self._now(), self._far, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
-    def thinner(self, u: Array | None = None) -> float:
-        """The least deformed thickness, over the undeformed one, at the present or a given displacement; collective."""
-        half = self._faces.half(self._now() if u is None else u) if self._faces else self._h / 2
-        return min(1.0, 2 * float(np.min(half)) / self._h)
+    def halves(self) -> tuple[Array, Array]:
+        """Half the undeformed thickness at all nodes, and the present one, over R; collective."""
+        undeformed = self._facing.half
+        return undeformed, self._faces.half(self._now()) if self._faces else undeformed
+
+    def thinnest(self, *displaced: Array) -> float:
+        """The least thickness of both parts over R, undeformed and at displacements of all nodes."""
+        half = self._facing.half, *(self._faces.half(u) for u in displaced if self._faces)
+        return 2 * min(float(each[self._touched].min()) for each in half)
 
     def meet(self, u: Array, v: Array) -> bool:
         """Whether any cells come near each other between two displacements of all nodes; collective."""
@@ -290,8 +307,7 @@ class Touching:
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        far = REACH * self._h
-        least = self._facing.found(self._of_copies(u), far).distance.min(initial=far)
+        least = self._facing.found(self._of_copies(u), self._far).distance.min(initial=self._far)
         return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
 
     def through(self, u: Array, v: Array) -> bool:
@@ -303,7 +319,7 @@ class Touching:
 
     def passes(self, u: Array, v: Array) -> bool:
         """The same of displacements of all that is faced."""
-        moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
+        moved, least = v - u, self.thinnest(u, v)
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
         if not self._facing.near_on_way(u, v):
