@@ -79,7 +79,7 @@ def meetings(
 
 
 def _gaps(x: Array, y: Array, of_x: Array, of_y: Array) -> tuple[Array, NDArray[np.int64]]:
-    """How far the faces of places x (n, 3) are from those of places y (m, 3), and the number of the nearest of these."""
+    """How far faces of places x (n, 3) are from those of places y (m, 3), and the numbers of the nearest of these."""
     away, near = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + min(NEAREST if np.ptp(of_y) else 1, len(y))))
     gaps = away - of_y[near] - of_x[:, None]
     least = np.arange(len(x)), gaps.argmin(axis=1)

@@ -1,6 +1,5 @@
 """Shells whose thickness varies touch: faces are half the local thickness from mid-surfaces."""
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.coupled import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.gap import SOFT
-from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
 h = 0.02

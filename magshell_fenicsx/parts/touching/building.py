@@ -11,6 +11,7 @@ from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
 from magshell_fenicsx.mesh.mirror import Image, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import Grown
+from magshell_fenicsx.parts.touching.by_fields import Shape
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
@@ -107,6 +108,7 @@ def touchings(
     varies = thickness is not None or keeps_volume.any()
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if varies else None
     segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h, planes)
+    shape = Shape(r0, thickness, cells_of_all.nodes, slice(first, first + count))
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
@@ -115,7 +117,7 @@ def touchings(
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         of_both = np.unique(cells.nodes[one | other])
-        touching = kind(pair, cells, segments, allowed, h, placed, moved, own, local, comm, of_both, faces)
+        touching = kind(pair, cells, segments, allowed, h, placed, moved, own, local, comm, of_both, shape, faces)
         deep, place = touching.deepest()
         if deep > WITHIN * h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)

@@ -10,7 +10,7 @@ exact.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -20,27 +20,7 @@ from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.parts.touching.nearest import SIGNS, Cells, Longs, Places, inverse, jets, slopes
 
-if TYPE_CHECKING:
-    from magshell_fenicsx.parts.touching.touching import Touching
-
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ByGrowth:
-    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
-
-    of: "Touching"
-    order: int = 1
-    amplitude: str | None = None
-
-    def energy(self) -> float:
-        """On this rank's part."""
-        return self.of.by_growth(self.order)
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first one; collective."""
-        self.of.add_by_growth(b, factor)
 
 
 @dataclass(frozen=True)
@@ -107,6 +87,8 @@ class Faces:
         self._table = cells.element.tabulate(1, cells.element.points)[1:, :, :, 0]
         J0 = self._areas(r0, slice(None))
         self._volumes = h / 2 * np.array([self._sum(slice(None), each * J0) for each in thickness])
+        self._thickness = thickness[0]
+        self._per_factor = h / 2 * thickness / thickness[0]  # by powers of the amplitude
         self._stays = self._sum(~thins, J0[~thins])
         self.undeformed = np.asarray(self._volumes[0] / self._sum(slice(None), J0))
 
@@ -133,6 +115,31 @@ class Faces:
         """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
         area = self._area(u)
         return scipy.sparse.diags_array(np.where(which, -self._volume() / area**2, 0.0)) @ self._slopes(u, which)
+
+    def change(self, u: Array, w: Array) -> Array:
+        """What H (nodes,) changes by along w (nodes, 3)."""
+        return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel() if len(self._thin) else 0 * u[:, 0])
+
+    def ratio(self, u: Array) -> tuple[Array, Array]:
+        """The volumes and areas (nodes,) whose ratio is H."""
+        return self._volume(), self._area(u)
+
+    def by_factor(self, by_volume: Array) -> Array:
+        """The derivatives (cells, functions) by what multiplies h, of those (nodes,) by volumes."""
+        at_places = np.bincount(self._same, by_volume, len(by_volume))[self._places]
+        per_factor = np.polynomial.polynomial.polyval(self.value, self._per_factor)
+        return np.asarray(at_places * per_factor * self._areas(self._r0, slice(None)))
+
+    def by_area(self, by_volume: Array, by_area: Array) -> Array:
+        """Those (nodes, 3) by the undeformed place, as far as volumes and areas that stay depend on it alone."""
+        of_volume, of_area = (np.bincount(self._same, f, len(f))[self._places] for f in (by_volume, by_area))
+        h_t = np.polynomial.polynomial.polyval(self.value, self._per_factor) * self._thickness
+        by_J0 = of_volume * h_t + of_area * ~self._thins[:, None]
+        some = np.flatnonzero((by_J0 != 0).any(axis=1))
+        slope = self._tilted(0 * self._r0, some).slope
+        forces = np.zeros(self._r0.size)
+        np.add.at(forces, unknowns(self._cells.nodes[some], len(self._r0)), np.einsum("cq,cqm->cm", by_J0[some], slope))
+        return forces.reshape(-1, 3)
 
     def slope_by_growth(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f dH, with dH by the amplitude."""

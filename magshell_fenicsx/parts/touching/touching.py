@@ -22,15 +22,17 @@ from functools import partial
 
 import numpy as np
 import scipy
+from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.connected import add_own
+from magshell_fenicsx.assembly.connected import add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
 from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.touching.by_fields import ByGrowth, Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import ByGrowth, Faces, hessians, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places, jets
@@ -70,6 +72,8 @@ class Touching:
         Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
     nodes
         Of both parts.
+    shape
+        The fields that the gap depends on.
     faces
         How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
     """
@@ -90,6 +94,7 @@ class Touching:
         local: tuple[int, int],
         comm: MPI.Comm,
         nodes: Longs,
+        shape: Shape,
         faces: Faces | None = None,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
@@ -100,7 +105,7 @@ class Touching:
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
-        self._touched = nodes
+        self._touched, self._shape = nodes, shape
         self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
@@ -165,36 +170,32 @@ class Touching:
         grown = self._faces.grown if self._faces else None
 
         def twice(before: Twice, q: object) -> Sequence[Derivative]:
-            return [*before(q), *([ByGrowth(self, 2)] if q is grown else [])]
+            return [*before(q), *([ByGrowth(self._present, self._add, 2)] if q is grown else [])]
 
         return {
-            name: replace(p, slopes=[*p.slopes, ByGrowth(self)], twice=partial(twice, p.twice))
+            name: replace(p, slopes=[*p.slopes, ByGrowth(self._present, self._add)], twice=partial(twice, p.twice))
             for name, p in parameters.items()
             if p.constant is grown
         }
 
-    def by_growth(self, order: int = 1) -> float:
-        """The first or second derivative of this rank's energy by the natural stretch."""
-        forces = self._forces()[:, 3]
-        of_forces = float(self._changed()[:, 3] @ self._growth()) if order == 2 else 0.0
-        return of_forces + float(forces @ self._growth(order))
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Of thickness and placement; see `assembly.coupled.KnowsFields`; collective."""
+        field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
+        if field is None:
+            return None
+        now, weights = self._present(), Weights(self._of_copies(whole(direction)), energy, force)
+        if name == "thickness":
+            of_cells = self._comm.allreduce(self._in_modelled(by_factor(now, weights)))
+            return field, of_cells[self._shape.own, :, None]
+        return field, self._shape.shared(self._comm.allreduce(self._on_modelled(by_place(now, weights))))
 
-    def add_by_growth(self, b: Array, factor: float) -> None:
-        """Add a factor times the gradient's derivative by the growth; collective."""
-        assert self._faces
-        forces = self._on_nodes(self._changed()) + self._faces.slope_by_growth(self._at, self._forces()[:, 3])
-        self._add(b, factor * forces)
-
-    def _growth(self, order: int = 1) -> Array:
-        assert self._faces
-        return self._faces.by_growth(self._at, order)
-
-    def _changed(self) -> Array:
-        """What the forces (nodes, 4) change by as the faces grow and nothing moves."""
-        rows, columns, values = self._by_parts()
-        along = np.concatenate([np.zeros(self._r0.size), self._growth()])
-        product = np.bincount(rows, values * along[columns], len(along))
-        return np.column_stack([product[: self._r0.size].reshape(-1, 3), product[self._r0.size :]])
+    def _present(self) -> Present:
+        places, joined, pressed = self._pressed()
+        of_all = self._cells, self._r0, self._at, self._faces, self._points
+        found = self._by_parts, self._entries, self._geometry
+        return Present(*of_all, places, joined, pressed, self._forces(), *found)
 
     def _on_nodes(self, forces: Array) -> Array:
         """The forces (nodes, 3) by the displacement, of those by place and thickness."""
@@ -395,6 +396,14 @@ class Touching:
     def _of_copies(self, u: Array) -> Array:
         """The displacement of all that is faced, of the nodes that are modelled."""
         return u
+
+    def _in_modelled(self, values: Array) -> Array:
+        """Derivatives by values in modelled cells, of those in all cells."""
+        return values
+
+    def _on_modelled(self, forces: Array) -> Array:
+        """Those (nodes, 3) on modelled nodes, of those on all."""
+        return forces
 
     def _forces(self) -> Array:
         """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
