@@ -8,8 +8,8 @@ on the places r0 + u; the energy is a sum over points with the weights J0(X). So
 and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay in their cells.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.parameters import Derivative, Parameter
 from magshell_fenicsx.parts.touching.faces import Faces, slope_of
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.segments import Points
@@ -131,6 +132,15 @@ class ByGrowth:
         now = self.of()
         forces = now.on_nodes(_grown(now)) + now.of_faces.slope_by_growth(now.u, now.forces[:, 3])
         self.add(b, factor * forces)
+
+
+def with_growth(grows: Parameter, of: Callable[[], Present], add: Callable[[Array, Array], None]) -> Parameter:
+    """A parameter with the derivatives of a contact by it among its own."""
+
+    def twice(q: object) -> Sequence[Derivative]:
+        return [*grows.twice(q), *([ByGrowth(of, add, 2)] if q is grows.constant else [])]
+
+    return replace(grows, slopes=[*grows.slopes, ByGrowth(of, add)], twice=twice)
 
 
 def _grown(now: Present) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.touching.facing import ALIKE
 from magshell_fenicsx.parts.touching.nearest import EXACT, FLAT, ROUNDS
+from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -138,6 +139,26 @@ class Curves:
         """(3, n, 3): places and two derivatives, of the curves through nodes (n, functions, 3)."""
         return np.asarray(np.einsum("dnk,nki->dni", self.table(2, X), nodal))
 
+    def rule(self, count: int, sides: tuple[Inside, Inside]) -> Rule:
+        """So many Gauss's points in each cell, in those with a free end the end among them.
+
+        `sides` tell whether each cell belongs to the first shell, and to the second.
+        """
+        ends = (self.beside < 0) & (np.abs(self._r0[self.nodes[:, :2], 0]) > SAME)
+        parts = list[tuple[Longs, Array, Array, Inside, Array, Inside]]()
+        for begins, last in ((False, False), (True, False), (False, True), (True, True)):
+            cells = np.flatnonzero(np.any(sides, axis=0) & (ends == [begins, last]).all(axis=1))
+            X, w = rule_on_line(count, begins, last)
+            table = self.table(1, X)
+            x, along = np.einsum("dqk,cki->dcqi", table, self._r0[self.nodes[cells]])
+            speed = np.linalg.norm(along, axis=2)
+            area = 2 * np.pi * x[..., 0] * speed * w
+            normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
+            on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
+            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
+            parts.append((cell, shape, area.ravel(), sides[0][cell], normal.reshape(-1, 2), on_edge))
+        return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
     def projected(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> Faced:
         """The nearest place of each cell, by Newton's method from the nearest of some."""
         shape = self.table(0, self._start)[0]
@@ -192,11 +213,26 @@ class Curves:
     def at_nodes(self, thickness: fem.Function) -> Array:
         """What multiplies h at nodes, of cells with a node in common the mean by their lengths."""
         t = thickness.x.array[thickness.function_space.dofmap.list]
-        weight = self.speeds()
-        sums = [np.bincount(self.nodes.ravel(), each.ravel(), len(self._r0)) for each in (weight * t, weight)]
-        return np.asarray(sums[0] / sums[1])
+        return self._sum(self.speeds() * t) / self.lengths
+
+    @property
+    def lengths(self) -> Array:
+        """The sum (nodes,) of the speeds of all cells at a node."""
+        return self._sum(self.speeds())
+
+    def _sum(self, values: Array) -> Array:
+        return np.bincount(self.nodes.ravel(), values.ravel(), len(self._r0)).astype(float)
 
     def speeds(self) -> Array:
         """(cells, functions) lengths per that of the reference cell at the nodes, undeformed."""
-        along = self.table(1, self.element.points.ravel())[1]
-        return np.asarray(np.linalg.norm(np.einsum("qk,cki->cqi", along, self._r0[self.nodes]), axis=2))
+        return np.asarray(np.linalg.norm(self._along()[1], axis=2))
+
+    def by_speed(self) -> Array:
+        """The derivatives (cells, functions, functions, 2) of these by the nodes of the cell."""
+        table, along = self._along()
+        unit = along / np.linalg.norm(along, axis=2)[..., None]
+        return np.asarray(table[None, :, :, None] * unit[:, :, None])
+
+    def _along(self) -> tuple[Array, Array]:
+        table = self.table(1, self.element.points.ravel())[1]
+        return table, np.einsum("qk,cki->cqi", table, self._r0[self.nodes])

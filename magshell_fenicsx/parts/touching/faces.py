@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.parts.touching.nearest import SIGNS, Cells, Longs, Places, inverse, jets, slopes
+from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
 
@@ -294,3 +295,32 @@ def hessians(
     for i in range(3):
         H[:, i::parts, i::parts] -= both
     return np.asarray(H)
+
+
+def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int) -> Entries:
+    """What the Hessian of joined places has besides those of each.
+
+    Parameters
+    ----------
+    slopes, nodes, group
+        Of all places: the weighted derivative (n, functions, parts) of the distance by the nodes (n, functions) of
+        `count`, and the joined one (n,) that it belongs to.
+    weight
+        Of each joined one.
+    """
+    parts = slopes.shape[2]
+    dofs = unknowns(nodes, count, parts)
+    entries = slopes.ravel(), (np.repeat(group, dofs.shape[1]), dofs.ravel())
+    G = scipy.sparse.coo_array(entries, (len(weight), parts * count)).tocsr()
+    hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
+    return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
+
+
+def geometry(cells: Cells, points: Points, r: Array, at: Places) -> tuple[Array, Array, Array, Longs]:
+    """Distances, normals, and beta (n, functions of both cells) with its nodes, where all nodes are at r."""
+    nodes = np.concatenate([cells.nodes[points.cell[at.point]], cells.nodes[at.cell]], axis=1)
+    half, N = nodes.shape[1] // 2, points.shape[at.point]
+    (shape, y), *_ = jets(cells.element, at.X, r[nodes[:, half:]], 0)
+    off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
+    d = np.linalg.norm(off, axis=1)
+    return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes

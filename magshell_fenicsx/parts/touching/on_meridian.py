@@ -26,11 +26,10 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
-from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Curves, Faced, Rule, distances, nowhere, slopes
+from magshell_fenicsx.parts.touching.curves import SIGNS, Curves, Faced, distances, nowhere, slopes
 from magshell_fenicsx.parts.touching.facing import STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
 from magshell_fenicsx.parts.touching.nearest import BULGE, FOLLOWING
-from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
 
@@ -69,12 +68,12 @@ class MeridianTouching:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
         self.stiffness = Number(pair.stiffness)
-        self._h, self._u, self._thickness = h, u, thickness
+        self._h, self._u, self._placement, self._thickness = h, u, r0, thickness
         V = r0.function_space
         self._nodes = V.dofmap.list.astype(np.int64)
         self._sides, self._r0 = sides, np.array(r0.x.array.reshape(-1, 2))
         self._curves = Curves(V.element.basix_element, self._nodes, self._r0, h)
-        self._rule = self._points(degree // 2 + 1)
+        self._rule = self._curves.rule(degree // 2 + 1, sides)
         self._normals = self._curves.cell_normals()
         self._half = h / 2 * (np.ones(len(self._r0)) if thickness is None else self._curves.at_nodes(thickness))
         of_both = self._half[self._nodes[np.any(sides, axis=0)]]
@@ -147,6 +146,60 @@ class MeridianTouching:
         H[:, 1::3] -= H[:, ::3]  # with P = U + V, U is P - V
         H[..., 1::3] -= H[..., ::3]
         return _entries(H / 2, nodes, 3)
+
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Of thickness and placement; see `assembly.coupled.KnowsFields` and `by_fields`."""
+        field = {"thickness": self._thickness, "r0": self._placement}.get(name)
+        if field is None:
+            return None
+        w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
+        by_half = self._by_half(w, energy, force)[self._nodes]
+        speeds, lengths = self._curves.speeds(), self._curves.lengths[self._nodes]
+        if name == "thickness":
+            return field, (by_half * self._h / 2 * speeds / lengths)[..., None]
+        rows, columns, values = self._entries()
+        stiff = np.bincount(rows, values * w.ravel()[columns], w.size).reshape(-1, 2)
+        nodal = energy * self._forces() + force * stiff + self._by_weights(w, energy, force)
+        if self._thickness is not None:
+            t = self._thickness.x.array[self._thickness.function_space.dofmap.list]
+            by_speed = by_half * (self._h / 2 * t - self._half[self._nodes]) / lengths
+            np.add.at(nodal, self._nodes, np.einsum("cq,cqki->cki", by_speed, self._curves.by_speed()))
+        count = np.bincount(self._nodes.ravel(), minlength=len(nodal))
+        return field, np.asarray((nodal / count[:, None])[self._nodes])
+
+    def _by_half(self, w: Array, energy: float, force: float) -> Array:
+        """By half the thickness at nodes (nodes,), of energy Pi + force w . Pi,u."""
+        at, by_half = self._pressed(), np.zeros(len(self._r0))
+        _, first, second = self._penalty(at)
+        off, n, beta, nodes = self._geometry(at)
+        count, functions = beta.shape
+        half, weight = functions // 2, self._rule.weight[at.point] / 2
+        normal, slide, A = self._rows(at, off, n, beta)
+        along = np.insert(w, 1, 0.0, axis=1)[nodes].reshape(count, -1)
+        farther, slid = (np.sum(row.reshape(count, -1) * along, axis=1) for row in (normal, slide))
+        thicker = np.concatenate([beta[:, :half], -beta[:, half:]], axis=1)
+        forces = (weight * (energy * first - force * second * farther))[:, None] * thicker
+        turned = np.where(at.free, slid / np.where(at.free, A, 1.0), 0.0)
+        forces[:, half:] -= (force * weight * first * turned)[:, None] * self._curves.table(1, at.X)[1]
+        np.add.at(by_half, nodes, forces)
+        return by_half
+
+    def _by_weights(self, w: Array, energy: float, force: float) -> Array:
+        """By the undeformed places of nodes (nodes, 2), as far as the weights of points depend on them."""
+        at, nodal = self._pressed(), np.zeros_like(self._r0)
+        value, first, _ = self._penalty(at)
+        _, n, beta, nodes = self._geometry(at)
+        farther = np.einsum("nk,ni,nki->n", beta, n, w[nodes])
+        per_weight = self._rule.weight[at.point] / 2 * (energy * value - force * first * farther)
+        own = self._nodes[self._rule.cell[at.point]]
+        shape, slope = self._curves.table(1, self._rule.shape[at.point] @ self._curves.element.points.ravel())
+        (rho, _), tangent = (np.einsum("nk,nki->in", table, self._r0[own]) for table in (shape, slope))
+        forces = slope[..., None] * (tangent / np.sum(tangent * tangent, axis=0)).T[:, None]
+        forces[..., 0] += shape / rho[:, None]
+        np.add.at(nodal, own, per_weight[:, None, None] * forces)
+        return nodal
 
     # what is seen
 
@@ -274,23 +327,6 @@ class MeridianTouching:
         """All nodes (nodes, 3), with half the thickness less h/2, or nothing, as the third component."""
         return np.column_stack([self._r0 + u, (self._half - self._h / 2) * faces])
 
-    def _points(self, count: int) -> Rule:
-        """So many Gauss's points in each cell, in those with a free end the end among them."""
-        ends = (self._curves.beside < 0) & (np.abs(self._r0[self._nodes[:, :2], 0]) > SAME)
-        parts = list[tuple[Longs, Array, Array, Inside, Array, Inside]]()
-        for begins, last in ((False, False), (True, False), (False, True), (True, True)):
-            cells = np.flatnonzero(np.any(self._sides, axis=0) & (ends == [begins, last]).all(axis=1))
-            X, w = rule_on_line(count, begins, last)
-            table = self._curves.table(1, X)
-            x, along = np.einsum("dqk,cki->dcqi", table, self._r0[self._nodes[cells]])
-            speed = np.linalg.norm(along, axis=2)
-            area = 2 * np.pi * x[..., 0] * speed * w
-            normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
-            on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
-            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
-            parts.append((cell, shape, area.ravel(), self._sides[0][cell], normal.reshape(-1, 2), on_edge))
-        return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
     def _x_of(self, r: Array) -> Array:
         """The points, with the third component of the other sign, see `distances`."""
         nodal = r[self._nodes[self._rule.cell]] * SIGNS[: r.shape[1]]
@@ -340,6 +376,17 @@ class MeridianTouching:
         off = np.einsum("nk,nki->ni", beta, r[nodes])
         return off, off / np.linalg.norm(off, axis=1)[:, None], beta, nodes
 
+    def _rows(self, at: Faced, off: Array, n: Array, beta: Array) -> tuple[Array, Array, Array]:
+        """By (U, V, W) at the nodes of both cells, (n, functions, 3): d,u, and C_s; and A (n,)."""
+        r = self._placed(self._at)
+        jets, half = self._curves.jets(at.X, r[self._nodes[at.cell]]), beta.shape[1] // 2
+        along = jets[1, :, :2] - np.sum(jets[1, :, :2] * n, axis=1)[:, None] * n
+        normal, slide = np.zeros((2, *beta.shape, 3))
+        normal[..., ::2] = beta[..., None] * n[:, None]
+        slide[..., ::2] = -beta[..., None] * along[:, None]
+        slide[:, half:, ::2] -= self._curves.table(1, at.X)[1][..., None] * off[:, None]
+        return normal, slide, slopes(self._x_of(r)[at.point], jets)[1]
+
     def _second(self, m: float) -> tuple[Array, Longs]:
         """(n, dofs, dofs) by (U, V, W) at the nodes of both cells, over the whole circumference."""
         at = self._pressed()
@@ -349,21 +396,14 @@ class MeridianTouching:
         half, d = functions // 2, np.linalg.norm(off, axis=1)
         weight = self._rule.weight[at.point] / 2
         bent = -weight * first / d
-        r = self._placed(self._at)
-        jets = self._curves.jets(at.X, r[self._nodes[at.cell]])
-        y, along = jets[0, :, :2], jets[1, :, :2]
-        along = along - np.sum(along * n, axis=1)[:, None] * n
-        rates = self._curves.table(1, at.X)[1]
-        normal, slide, turn = (np.zeros((count, functions, 3)) for _ in range(3))
-        normal[..., ::2] = beta[..., None] * n[:, None]
-        slide[..., ::2] = -beta[..., None] * along[:, None]
-        slide[:, half:, ::2] -= rates[..., None] * off[:, None]
+        normal, slide, A = self._rows(at, off, n, beta)
+        y = self._curves.jets(at.X, (self._r0 + self._at)[self._nodes[at.cell]])[0]
+        turn = np.zeros((count, functions, 3))
         turn[..., 1] = -beta * y[:, :1]
         shape = -beta[:, half:]
         turn[:, half:, 0] += m * off[:, :1] * shape
         turn[:, half:, 1] += off[:, :1] * shape
         turn[:, half:, 2] += m * off[:, 1:] * shape
-        A = slopes(self._x_of(r)[at.point], jets)[1]
         B = y[:, 0] * (y[:, 0] + off[:, 0])
         inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
         rows = np.stack([each.reshape(count, 3 * functions) for each in (normal, slide, turn)], axis=1)

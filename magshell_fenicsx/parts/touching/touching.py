@@ -17,25 +17,23 @@ plus h, so that |x - y| need not be the least. Of shells that get thinner H foll
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
-from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
+from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import SOFT, penalty
-from magshell_fenicsx.parts.touching.by_fields import ByGrowth, Present, Shape, Weights, by_factor, by_place
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place, with_growth
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import Faces, hessians, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places, jets
+from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
@@ -168,15 +166,7 @@ class Touching:
     def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
         """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
         grown = self._faces.grown if self._faces else None
-
-        def twice(before: Twice, q: object) -> Sequence[Derivative]:
-            return [*before(q), *([ByGrowth(self._present, self._add, 2)] if q is grown else [])]
-
-        return {
-            name: replace(p, slopes=[*p.slopes, ByGrowth(self._present, self._add)], twice=partial(twice, p.twice))
-            for name, p in parameters.items()
-            if p.constant is grown
-        }
+        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
@@ -236,7 +226,11 @@ class Touching:
         if not rows:
             return nothing, nothing, np.zeros(0)
         if several.any():
-            i, j, v = self._between(whole, joined, of_group, bend)
+            jointly = several[joined.group]
+            _, n, beta, nodes = self._geometry(whole.of(jointly))
+            slopes = joined.weight[jointly, None, None] * slope_of(n, beta, self._parts)
+            of_joined = self._points.weight[whole.point[joined.first]] / 2 * (bend - of_group / (BLUR * self._h))
+            i, j, v = between(slopes, nodes, joined.group[jointly], of_joined, len(self._r0))
             rows, columns, values = [*rows, i], [*columns, j], [*values, v]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
@@ -446,27 +440,5 @@ class Touching:
         """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
         self._about = pressed.on(self._r0)
 
-    def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
-        """What the Hessian of joined places has besides those of each."""
-        some = joined.several[joined.group]
-        part, group = at.of(some), joined.group[some]
-        _, n, beta, nodes = self._geometry(part)
-        g = (joined.weight[some, None, None] * slope_of(n, beta, self._parts)).reshape(len(n), -1)
-        dofs = unknowns(nodes, len(self._r0), self._parts)
-        at_row = np.repeat(group, dofs.shape[1])
-        entries = g.ravel(), (at_row, dofs.ravel())
-        G = scipy.sparse.coo_array(entries, (len(first), self._parts * len(self._r0))).tocsr()
-        weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
-        hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
-        return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
-
     def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
-        """Distances, normals, and beta (n, functions of both cells) with its nodes."""
-        nodes = np.concatenate([self._cells.nodes[self._points.cell[at.point]], self._cells.nodes[at.cell]], axis=1)
-        r = self._r0 + self._at
-        half = nodes.shape[1] // 2
-        N = self._points.shape[at.point]
-        (shape, y), *_ = jets(self._cells.element, at.X, r[nodes[:, half:]], 0)
-        off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
-        d = np.linalg.norm(off, axis=1)
-        return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
+        return geometry(self._cells, self._points, self._r0 + self._at, at)
