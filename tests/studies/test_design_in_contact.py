@@ -13,7 +13,7 @@ h = 0.02
 
 @pytest.mark.slow
 def test_thickness_of_two_strips(tmp_path: Path) -> None:
-    """The upper of two cantilevers presses on the lower one, whose tip sinks less where both are thick at their roots."""
+    """The upper of two cantilevers presses on the lower one, whose tip sinks less if roots are thick."""
     strips = [Sheet(n, (0, 0, z), (1, 0, 0), (0, 0.2, 0), (5, 1)) for n, z in (("lower", 0), ("upper", 1.4 * h))]
     write(tmp_path / "strips.msh", strips)
     shell = {"geometry": "mesh", "file": "strips.msh", "radius": 1, "thickness": h, "youngs_modulus": 1}
