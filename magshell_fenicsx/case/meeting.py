@@ -19,6 +19,7 @@ AROUND, APART = 1.0, 2.0  # of sqrt(R h): how far from there, and how far from e
 ALIKE = 0.5  # of the thickness: places that are so much farther from each other may meet as well
 FAR = 20.0  # thicknesses: shells that are farther from each other may meet anywhere, or nowhere
 EXACT = 1e-12  # change of the square of the distance at which a search ends
+NEAREST = 50  # places of a mid-surface among which that of the nearest face is
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Meeting:
 def meetings(
     pairs: Sequence[Sequence[str]],
     places: Mapping[str, Array],
-    thickness: Mapping[str, float],
+    thickness: Mapping[str, Array | float],
     apart: Mapping[str, float],
     charted: "Mapping[str, Charted]",
 ) -> dict[str, list[Array]]:
@@ -49,38 +50,53 @@ def meetings(
     places
         Name -> places (n, 3) all over it.
     thickness, apart
-        Name -> its thickness, and how far from each other places are one; of all in the same length.
+        Name -> its thickness, at all places or everywhere, and how far from each other places are one; of all in the
+        same length.
     charted
         Name -> its chart; without one its places are those that are given.
     """
     names = list(places)
     every = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     found: dict[str, list[Array]] = {name: [] for name in names}
+    half = {name: np.broadcast_to(np.asarray(thickness[name]) / 2, len(places[name])) for name in names}
     for a, b in every if [WHOLE, WHOLE] in [[*pair] for pair in pairs] else pairs:
         if a == b or a not in places or b not in places:
             continue
         for one, other in ((a, b), (b, a)):
             x = places[one]
-            away, which = scipy.spatial.KDTree(places[other]).query(x)
-            first = int(np.argmin(away))
-            alike = x[away < away.min() + ALIKE * thickness[one]]
+            gaps, which = _gaps(x, places[other], half[one], half[other])
+            first = int(np.argmin(gaps))
+            h = 2 * float(half[one].mean())
+            alike = x[gaps < gaps.min() + ALIKE * h]
             if np.linalg.norm(alike - x[first], axis=1).max() >= apart[one]:
                 continue
             ends = x[first], places[other][which[first]]
             if one in charted and other in charted:
                 ends = _nearest(*ends, charted[one], charted[other])
-            if np.linalg.norm(ends[0] - ends[1]) < FAR * thickness[one]:
+            if np.linalg.norm(ends[0] - ends[1]) < FAR * h:
                 found[one].append(ends[0])
     return found
 
 
+def _gaps(x: Array, y: Array, of_x: Array, of_y: Array) -> tuple[Array, NDArray[np.int64]]:
+    """How far faces of places x (n, 3) are from those of places y (m, 3), and the numbers of the nearest of these."""
+    away, near = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + min(NEAREST if np.ptp(of_y) else 1, len(y))))
+    gaps = away - of_y[near] - of_x[:, None]
+    least = np.arange(len(x)), gaps.argmin(axis=1)
+    return gaps[least], near[least]
+
+
 @dataclass(frozen=True)
 class Charted:
-    """A shell in the frame of all: charts (2,) of places (3,), and the other way round."""
+    """A shell in the frame of all: charts (2,) of places (3,), and the other way round.
+
+    `half` is half the thickness at its own places (n, 3), over the length of all; None where it is the same everywhere.
+    """
 
     outline: Outline
     place: Callable[[Array], Array]
     own: Callable[[Array], Array]
+    half: Callable[[Array], Array] | None = None
 
     def chart(self, x: Array) -> Array:
         """That of a place."""
@@ -90,13 +106,24 @@ class Charted:
         """The place of a chart, or of the nearest one that the shell has."""
         return self.place(self.outline.embedding(self.outline.within(chart)[None])[0])
 
+    def depth(self, x: Array) -> float:
+        """How far a place is below the face, less what it is everywhere."""
+        return float(self.half(self.own(x)[None])[0]) if self.half else 0.0
+
 
 def _nearest(x: Array, y: Array, of_x: Charted, of_y: Charted) -> tuple[Array, Array]:
-    """The places of two surfaces, near x and y, that are nearest to each other."""
+    """The places of two surfaces, near x and y, whose faces are nearest to each other."""
 
     def apart(charts: Array) -> Array:
         return of_x.at(charts[:2]) - of_y.at(charts[2:])
 
+    def gap(charts: Array) -> float:
+        ends = of_x.at(charts[:2]), of_y.at(charts[2:])
+        return float(np.linalg.norm(ends[0] - ends[1])) - of_x.depth(ends[0]) - of_y.depth(ends[1])
+
     start = np.concatenate([of_x.chart(x), of_y.chart(y)])
-    found = scipy.optimize.least_squares(apart, start, ftol=EXACT, xtol=EXACT, gtol=EXACT).x
+    if of_x.half or of_y.half:
+        found = scipy.optimize.minimize(gap, start).x
+    else:
+        found = scipy.optimize.least_squares(apart, start, ftol=EXACT, xtol=EXACT, gtol=EXACT).x
     return of_x.at(found[:2]), of_y.at(found[2:])

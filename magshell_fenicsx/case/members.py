@@ -150,15 +150,21 @@ class Members:
     def _met(self) -> Mapping[str, Sequence[Array]]:
         """Name of a shell -> places (3,) in its own frame where others that it may touch are nearest."""
         several, places, near = self._several, dict[str, Array](), dict[str, Charted]()
-        thickness, apart = dict[str, float](), dict[str, float]()
+        thickness, apart = dict[str, Array | float](), dict[str, float]()
         if not several.pairs:
             return {part.name: [] for part in several.parts}
         for part, ground in zip(several.parts, self._grounds, strict=True):
             h, place = 1 / part.case.shell.R_over_h, several.place(part)
-            places[part.name] = place(ground.perfect.sample())
-            thickness[part.name], apart[part.name] = h * place.scale, APART * sqrt(h) * place.scale
+            sample, scale = ground.perfect.sample(), place.scale
+
+            def half(x: Array, ground: Ground = ground, scale: float = scale) -> Array:
+                return np.asarray(scale * ground.half_thickness(x))
+
+            varies = half if ground.thickness_factor else None
+            places[part.name], apart[part.name] = place(sample), APART * sqrt(h) * scale
+            thickness[part.name] = 2 * varies(sample) if varies else h * scale
             if ground.perfect.charts() is not None:
-                near[part.name] = Charted(ground.perfect, place, place.own)
+                near[part.name] = Charted(ground.perfect, place, place.own, varies)
         found = meetings(several.pairs, places, thickness, apart, near)
         return {part.name: [several.place(part).own(x) for x in found[part.name]] for part in several.parts}
 

@@ -133,9 +133,8 @@ class Several:
         moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
         laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
         members = Members(self)
-        of_shells = self.joints, self._thicknesses, moduli, laws
         of_members = members.mirrors, partial(meridians, self), members.normal, members.half
-        return Assembly(self.digest, members.whole, *of_shells, *of_members)
+        return Assembly(self.digest, members.whole, self.joints, moduli, laws, *of_members)
 
     def of(self, name: str) -> str:
         """The shell of an edge, or itself."""
@@ -224,11 +223,6 @@ class Several:
             if part.section.remanent and part.section.remanent.file:
                 by_key[part.refused("remanent")] = part.section.remanent
         return by_key
-
-    @property
-    def _thicknesses(self) -> dict[str, float | None]:
-        """Of each over that of the first one; None where it varies."""
-        return {part.name: None if part.case.thickness_factor else self.ratio(part) for part in self.parts}
 
 
 def _about(i: int, j: int) -> Callable[[float], Array]:

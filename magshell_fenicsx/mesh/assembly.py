@@ -102,8 +102,6 @@ class Assembly:
         Makes its shells, each rank the same; a `MeshError` or `CaseError` begins with the key of one that cannot be.
     joints
         Pairs of names of edges; the first is joined to the second.
-    thicknesses
-        Name of a shell -> its thickness over that of the first; None where it varies.
     moduli
         Name of a shell -> its Young's modulus over that of the first.
     laws
@@ -125,7 +123,6 @@ class Assembly:
     digest: str
     members: Callable[[], Sequence[Member]] = field(repr=False)
     joints: Sequence[tuple[str, str]] = ()
-    thicknesses: Mapping[str, float | None] = field(default_factory=dict)
     moduli: Mapping[str, float] = field(default_factory=dict)
     laws: Mapping[str, str] = field(default_factory=dict)
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)

@@ -85,8 +85,6 @@ class Context:
             missing |= ability.withdraws(self)
         if self.solid:
             missing["a mid-surface"] = "a solid has none: take model: shell"
-        if self.shell.thickness_factor is not None:
-            missing["the same thickness everywhere"] = "leave out shell.thickness_factor"
         return missing
 
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
@@ -240,7 +238,6 @@ class Account:
 Offer = Literal[
     "a mid-surface",
     "the whole shell",
-    "the same thickness everywhere",
     "a thickness that does not change",
     "the area as drawn",
     "a material without viscosity",

@@ -221,7 +221,8 @@ class MeridianModel(Thin):
         if loads.pairs:
             from magshell_fenicsx.parts.touching.on_meridian import touchings
 
-            self.touchings = touchings(loads.pairs, self.r0, self.u, meridian.patches, self.material.h, rule)
+            curves = self.r0, self.u, meridian.patches, self.material.h, rule
+            self.touchings = touchings(loads.pairs, *curves, self.thickness)
         for each in self.touchings:
             stiffnesses |= each.history
         self.system = FiniteElementSystem(

@@ -36,7 +36,7 @@ def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, gue
         if here_at.of(each.penetration):
             lets_go |= not guess_at.of(each.penetration)
         else:
-            at = _onset(each, each.pair.thickness * scene.problem.material.h, u, v)
+            at = _onset(each, scene.problem.material.h, u, v)
             meets = min(meets, at, key=lambda each: (each[0], not each[1]))
     return Ahead(*meets, lets_go)
 
@@ -53,13 +53,13 @@ def _onset(touching: Touching, h: float, u: Array, v: Array) -> tuple[float, boo
     most, deep = 2 * float(np.linalg.norm(v - u, axis=1).max()), DEEP * h
     if not most or not touching.meet(u, v) or (at_low := touching.gap(u)) <= 0:
         return 1.0, False
-    sets_in = at_low < CLOSE * deep
+    sets_in, thinnest = at_low < CLOSE * deep, touching.thinnest()
     low, high, at_high, aim = 0.0, 0.0, 0.0, -deep if sets_in else deep
     for _ in range(MOST):
         if high:
             part = low + (high - low) * (at_low - aim) / (at_low - at_high)
         else:  # so far no face can pass through another one
-            part = min(1.0, low + (at_low + NEARER * h) / most)
+            part = min(1.0, low + (at_low + NEARER * thinnest) / most)
         gap = touching.gap(u + part * (v - u))
         if gap < aim - deep:
             high, at_high = part, gap

@@ -1,9 +1,13 @@
 """Shells that overlap undeformed, without the equations of a scene, which refuses them in the same words."""
 
+from dataclasses import replace
+
 from dolfinx import fem
 from mpi4py import MPI
 
 from magshell_fenicsx.models.carriers import on_meridian, on_surface
+from magshell_fenicsx.models.shell.patterns import carried, cells_of
+from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
@@ -18,7 +22,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     MeshError
         With the shells, by how much, and where.
     """
-    pairs, h = problem.loads.pairs, problem.material.h
+    pairs, h, given = problem.loads.pairs, problem.material.h, problem.thickness
     if not pairs or cells > MOST:
         return
     if problem.axisymmetric:
@@ -27,11 +31,15 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
-        curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule)
+        thickness = thickness_field(given, r0, meridian.patches) if given else None
+        curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness)
         return
     from magshell_fenicsx.parts.touching.building import touchings
 
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
     r0 = surface.placement(V)
-    touchings(pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule)
+    if given and given.given:
+        given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
+    thickness = thickness_field(given, r0, surface.patches) if given else None
+    touchings(pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness)

@@ -85,7 +85,7 @@ def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
             raised[contact.setting] = STIFFER * k
     for pair, deep in between(scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
-        if deep > NEARLY * pair.bound * h and k < AT_A_CORNER * pair.stiffness:
+        if deep > NEARLY * pair.bound and k < AT_A_CORNER * pair.stiffness:
             raised[pair.setting] = STIFFER * k
     return raised
 
@@ -105,9 +105,9 @@ def recut(stage: Stage, low: Point, high: Point) -> State | None:
 
 
 def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
-    """The pairs of shells that may touch, with their penetrations over R; collective."""
+    """The pairs of shells that may touch, with their penetrations over the thickness there; collective."""
     at = scene.model.system.at(state)
-    return [(each.pair, at.of(each.penetration)) for each in scene.model.touchings]
+    return [(each.pair, at.of(each.depth)) for each in scene.model.touchings]
 
 
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
@@ -127,15 +127,17 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         return
     end = stage.leave(high.state)
     whole = [of_all_nodes(stage.scene, state) for state in (stage.leave(low.state), end)]
-    x0, h = model.r0.x.array[: model.system.size].reshape(-1, 3), stage.scene.problem.material.h
+    x0 = model.r0.x.array[: model.system.size].reshape(-1, 3)
     x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
     at, touchings = model.system.at(end), [t for t in model.touchings if isinstance(t, Touching)]
-    half = h / 2 * min(at.of(each.thinner) for each in touchings)
+    own = slice(*model.V.dofmap.index_map.local_range)
+    undeformed, half = (each[own] for each in at.of(touchings[0].halves))
+    half = np.minimum(half, undeformed)
     seen_through = [*model.mirror.sides.values()] if model.multiplicity > 1 else []
     for plane in (each for each in model.planes if each not in seen_through):
         before, after = plane.beyond(x0), plane.beyond(x)
         side = np.sign(comm.allreduce(float(before.sum())))
-        if comm.allreduce(int(np.sum((side * before > h) & (side * after < half)))):
+        if comm.allreduce(int(np.sum((side * before > 2 * undeformed) & (side * after < half)))):
             raise PathStopped(
                 "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
                 "model both sides",
@@ -229,8 +231,8 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
             )
     for pair, deep in between(scene, state):
         bound = pair.bound * (IMPACT if moving else 1.0)
-        if deep > bound * h:
-            what = f"the penetration between {pair.words} is {deep / h:.3g} h, more than {bound:g} h"
+        if deep > bound:
+            what = f"the penetration between {pair.words} is {deep:.3g} h, more than {bound:g} h"
             if moving:
                 raise Stopped(f"{what}: they hit each other too fast for the penalty")
             raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.meeting import FINE, Charted, meetings
+from magshell_fenicsx.case.members import Members
 from magshell_fenicsx.shape.outline import outline
 
 Array = NDArray[np.float64]
@@ -70,3 +71,17 @@ def test_the_place_is_that_of_spheres(off: float) -> None:
     found = meetings([["a", "b"]], places, dict.fromkeys("ab", 0.02), dict.fromkeys("ab", 0.3), charted)
     assert found["a"][0] == pytest.approx(centre / 2.03, abs=1e-3)
     assert found["b"][0] == pytest.approx(centre - centre / 2.03, abs=1e-3)
+
+
+def test_the_place_of_thick_faces() -> None:
+    """A flat sheet above one that is thickest beside the middle: there; 1e-4."""
+    plate = {"geometry": "plate", "length": 1, "width": 1, "thickness": h, "poisson_ratio": 0.3, "youngs_modulus": 1}
+    held = {"boundary": {"left": "clamped"}}
+    thick = {"shell": plate | {"thickness_factor": "1 + 3*exp(-20*((x - 0.3)**2 + (y - 0.6)**2))"}, **held}
+    flat = {"shell": plate, "place": {"position": [0, 0, 3 * h]}, **held}
+    data = {"shells": {"thick": thick, "flat": flat}, "contact": [["thick", "flat"]], "loading": PRESSED}
+    several = Case.from_source(data).several
+    assert several
+    met = Members(several)._met
+    assert met["thick"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)
+    assert met["flat"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)

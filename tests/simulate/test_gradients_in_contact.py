@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.assembly import Place
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
+from magshell_fenicsx.parts.touching.expanded import _area
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.numbers import on_mesh_of
@@ -119,6 +127,11 @@ def with_remanence(scene: Scene, along: Callable[[Array], Array], c: float) -> S
     return Scene(replace(scene.problem, loads=replace(loads, magnetic=magnetic)))
 
 
+def even(x: Array) -> Array:
+    """As halves are in x, and on a meridian."""
+    return np.asarray(np.cos(3 * x[..., 0]))
+
+
 def smooth(x: Array) -> Array:
     """As halves are in x."""
     even = np.cos(3 * x[..., 0]) - 0.5 * x[..., 1]
@@ -143,8 +156,77 @@ def test_half_of_two_arches() -> None:
     values = [functional(each, solved(each).point.state, "lower_top_uy").value for each in (ahead, back)]
     expected = (values[0] - values[1]) / 2e-3
     assert by_field.along(smooth(by_field.places)) == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(CaseError, match="deviation: no gradient by this field with contact between shells"):
-        gradient(scene, last, of="energy", by="deviation")
+
+
+def thicker(scene: Scene, c: float) -> Scene:
+    """The scene with another thickness on the same mesh."""
+    given = scene.problem.thickness or Thickness(patches={"lower": 1.0, "upper": 1.0})
+    assert given.patches
+    own = Thickness(lambda x, y, z: 1 + c * even(np.stack([x, y, z], axis=-1)))
+    space = Place(np.eye(3), np.zeros(3), 1.0)
+    patches = {name: PlacedFactor(own, space, float(times)) for name, times in given.patches.items()}  # type: ignore
+    return Scene(replace(scene.problem, thickness=replace(given, patches=patches)))
+
+
+def deviated(scene: Scene, c: float, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """The scene with another shape on the same mesh: both shells moved along their normals."""
+    surface = Meridian if scene.model.axisymmetric else Midsurface
+    drawn = surface.placement
+
+    def placement(self: Any, V: Any) -> Any:
+        r0 = drawn(self, V)
+        x = r0.x.array.reshape(-1, V.dofmap.bs)
+        x += c * h * even(x)[:, None] * outward(x)
+        return r0
+
+    with monkeypatch.context() as patch:
+        patch.setattr(surface, "placement", placement)
+        return Scene(scene.problem)
+
+
+def outward(x: Array) -> Array:
+    """In the plane of the first two components from the axis, or centre, of the shell that a place belongs to."""
+    off = x - np.where(x[:, 1] < 1 + GAP / 3, 0.0, 2 + GAP)[:, None] * np.eye(x.shape[1])[1]
+    off[:, 2:] = 0
+    return np.asarray(off / np.linalg.norm(off, axis=1)[:, None])
+
+
+def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
+    """The equilibrium of another scene, whose points are those of the state of the first one."""
+    (one,), (same,), state = scene.model.touchings, other.model.touchings, last.point.state
+    number = state.mu.get(one.pair.cuts, 0.0)
+    points, normals = scene.model.system.at(state).of(lambda: one._cuts.points(number, one._now()))
+    area, its = (_area(one._cells, each._r0, points) for each in (one, same))
+    same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
+    solution = other.newton.solve(state, "lambda_m", GivenLoad("lambda_m", state.mu["lambda_m"]))
+    assert solution.converged
+    return solution.state
+
+
+def agrees(scene: Scene, last: Record, by: str, ends: list[tuple[Scene, State]]) -> None:
+    """The derivatives of a displacement and the energy along `even`, by a difference: 1e-5."""
+    for of in ("lower_top_uz" if scene.model.axisymmetric else "lower_top_uy", "energy"):
+        found = gradient(scene, last, of=of, by=by)[by]
+        assert isinstance(found, FieldGradient)
+        upper = found.places[..., 2 if scene.model.axisymmetric else 1] > 1 + GAP / 3
+        times = np.where(upper & (scene.problem.thickness is not None), 1.25, 1.0)
+        along = even(found.places) * (h if by == "deviation" else times)
+        values = [functional(*each, of).value for each in ends]
+        assert found.along(along[..., None]) == pytest.approx((values[0] - values[1]) / (2 * STEP), rel=1e-5), (by, of)
+
+
+@pytest.mark.slow
+def test_by_fields_of_the_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the thickness of both arches, on which the gap depends, and by their place; the lower one is of rubber."""
+    data = deepcopy(ARCHES)
+    data["shells"]["lower"]["shell"] |= {"law": "neo-hookean", "poisson_ratio": 0.5}
+    scene = Scene(Case.from_source(data))
+    last = solved(scene)
+    assert scene.observe(last.point.state)["contact_force"] > 0.01
+    makes = {"thickness": thicker, "deviation": partial(deviated, monkeypatch=monkeypatch)}
+    for name, make in makes.items():
+        ends = [(made, with_same_cuts(scene, last, made)) for made in (make(scene, way * STEP) for way in (1, -1))]
+        agrees(scene, last, name, ends)
 
 
 @pytest.mark.slow
@@ -160,3 +242,22 @@ def test_ranks(tmp_path: Path) -> None:
         summary = json.loads((out / "summary.json").read_text())
         found.append(summary["gradients"]["lower_top_uy"]["numbers"])
     assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("upper", [{}, {"thickness": h}])
+def test_by_fields_on_meridians(upper: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same of two caps on their meridians, also where the thickness is no field in what was solved."""
+    data = deepcopy(CAPS)
+    data["shells"]["upper"]["shell"] |= upper
+    scene = Scene(Case.from_source(data))
+    last = solved(scene)
+    state = last.point.state
+    makes = {"thickness": thicker, "deviation": partial(deviated, monkeypatch=monkeypatch)}
+    for name, make in makes.items():
+        ends = list[tuple[Scene, State]]()
+        for way in (1, -1):
+            made = make(scene, way * STEP)
+            solution = made.newton.solve(state, "w", GivenLoad("w", state.mu["w"]))
+            assert solution.converged
+            ends.append((made, solution.state))
+        agrees(scene, last, name, ends)

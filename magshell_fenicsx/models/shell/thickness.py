@@ -67,9 +67,13 @@ class PlacedFactor:
     times: float
 
     def in_cells(self, cells: Cells) -> Array:
-        """Its values (cells, nodes) in cells in space; collective."""
-        at_place = replace(cells, nodal=self.place.own(cells.nodal))
-        return self.times * self.own.shown(at_place, self.own.at(at_place.nodal))
+        """Its values (cells, nodes) in cells in space, or on a meridian around its axis; collective."""
+        if cells.nodal.shape[-1] == 3:
+            nodal = x = self.place.own(cells.nodal)
+        else:
+            x = self.place.own(np.insert(cells.nodal, 1, 0.0, axis=-1))
+            nodal = np.stack([np.hypot(x[..., 0], x[..., 1]), x[..., 2]], axis=-1)
+        return self.times * self.own.shown(replace(cells, nodal=nodal), self.own.at(x))
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:

@@ -11,6 +11,7 @@ from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
 from magshell_fenicsx.mesh.mirror import Image, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import Grown
+from magshell_fenicsx.parts.touching.by_fields import Shape
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.mirrored import Images, Mirrored
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
@@ -44,7 +45,7 @@ def touchings(
     patches
         Name -> which cells of this rank.
     h
-        Thickness over R.
+        Thickness over R; where it varies, that of the first shell.
     degree
         Of the quadrature.
     thickness
@@ -104,8 +105,10 @@ def touchings(
         named = {name: copies.each(inside) for name, inside in named.items()}
         powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
         kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
-    faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if keeps_volume.any() else None
+    varies = thickness is not None or keeps_volume.any()
+    faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if varies else None
     segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h, planes)
+    shape = Shape(r0, thickness, cells_of_all.nodes, slice(first, first + count))
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
@@ -113,10 +116,10 @@ def touchings(
         def allowed(i: Longs, j: Longs, one: Inside = one, other: Inside = other) -> NDArray[np.bool_]:
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
-        own_h = pair.thickness * h
-        touching = kind(pair, cells, segments, allowed, own_h, placed, moved, own, local, comm, faces)
+        of_both = np.unique(cells.nodes[one | other])
+        touching = kind(pair, cells, segments, allowed, h, placed, moved, own, local, comm, of_both, shape, faces)
         deep, place = touching.deepest()
-        if deep > WITHIN * own_h:
+        if deep > WITHIN * h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)
             raise MeshError(
                 f"contact: {pair.words} overlap undeformed, by {deep / h:.4g} h at ({where}) R: move them apart"

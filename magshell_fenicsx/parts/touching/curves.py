@@ -1,13 +1,25 @@
-"""Points on meridians, and the places of other meridians that are nearest to them."""
+"""Points on meridians, and the places of other meridians that are nearest to them.
+
+Places have rho, z, and half the thickness less h/2, of points with the other sign: see `nearest` and `on_meridian`.
+"""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.touching.facing import ALIKE
+from magshell_fenicsx.parts.touching.nearest import EXACT, FLAT, ROUNDS
+from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
+START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
+SAME = 1e-9  # of h: places of two cells at the same distance are one
+SIGNS = np.array([1.0, 1.0, -1.0])  # of the squares of components in A
 
 
 @dataclass(frozen=True)
@@ -74,3 +86,153 @@ def nowhere() -> Faced:
     """No places."""
     nothing = np.zeros(0, dtype=np.int64)
     return Faced(nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
+
+
+def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
+    """How far places are drawn to points x (n, 3) along their curves with these jets, the derivative A of that with the
+    other sign, and that of a straight line; all (n,) times the distance."""
+    y, first, second = jets
+    off = np.column_stack([(x - y)[:, :2], np.linalg.norm((x - y)[:, :2], axis=1)])
+    speed = np.sum(first * first * SIGNS, axis=1)
+    return np.sum(off * first, axis=1), speed - np.sum(off * second, axis=1), speed
+
+
+def distances(off: Array) -> Array:
+    """Those (...,) of the differences (..., 3) between points and places."""
+    return np.asarray(np.linalg.norm(off[..., :2], axis=-1) + off[..., 2])
+
+
+class Curves:
+    """The meridians of all shells.
+
+    Parameters
+    ----------
+    element
+        Of basix, with its nodes.
+    nodes
+        (cells, functions).
+    r0
+        (nodes, 2) undeformed.
+    h
+        Thickness over R.
+
+    Attributes
+    ----------
+    element, nodes
+        The same.
+    beside
+        (cells, 2): the cell beyond each end; -1 where there is none.
+    """
+
+    def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
+        self.element, self.nodes, self._r0, self._h = element, nodes, r0, h
+        self.beside = beside(nodes)
+        self._start = np.linspace(0.0, 1.0, START * element.degree + 1, dtype=np.float64)
+
+    def table(self, order: int, X: Array) -> Array:
+        """Shape functions and derivatives (order + 1, n, functions); basix takes no empty X."""
+        if not len(X):
+            return np.zeros((order + 1, 0, self.nodes.shape[1]))
+        return np.asarray(self.element.tabulate(order, X[:, None])[..., 0])
+
+    def jets(self, X: Array, nodal: Array) -> Array:
+        """(3, n, 3): places and two derivatives, of the curves through nodes (n, functions, 3)."""
+        return np.asarray(np.einsum("dnk,nki->dni", self.table(2, X), nodal))
+
+    def rule(self, count: int, sides: tuple[Inside, Inside]) -> Rule:
+        """So many Gauss's points in each cell, in those with a free end the end among them.
+
+        `sides` tell whether each cell belongs to the first shell, and to the second.
+        """
+        ends = (self.beside < 0) & (np.abs(self._r0[self.nodes[:, :2], 0]) > SAME)
+        parts = list[tuple[Longs, Array, Array, Inside, Array, Inside]]()
+        for begins, last in ((False, False), (True, False), (False, True), (True, True)):
+            cells = np.flatnonzero(np.any(sides, axis=0) & (ends == [begins, last]).all(axis=1))
+            X, w = rule_on_line(count, begins, last)
+            table = self.table(1, X)
+            x, along = np.einsum("dqk,cki->dcqi", table, self._r0[self.nodes[cells]])
+            speed = np.linalg.norm(along, axis=2)
+            area = 2 * np.pi * x[..., 0] * speed * w
+            normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
+            on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
+            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
+            parts.append((cell, shape, area.ravel(), sides[0][cell], normal.reshape(-1, 2), on_edge))
+        return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def projected(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> Faced:
+        """The nearest place of each cell, by Newton's method from the nearest of some."""
+        shape = self.table(0, self._start)[0]
+        off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
+        X = self._start[distances(off).argmin(axis=1)]
+        for _ in range(ROUNDS):
+            pull, bent, speed = slopes(x[point], self.jets(X, nodal[cell]))
+            step = pull / np.where(bent > FLAT * speed, bent, speed)
+            after = np.clip(X + np.clip(step, -0.25, 0.25), 0.0, 1.0)
+            moved, X = np.abs(after - X).max(initial=0.0), after
+            if moved < EXACT:
+                break
+        jets = self.jets(X, nodal[cell])
+        pull, *_ = slopes(x[point], jets)
+        free = ~((X == 0.0) & (pull <= 0) | (X == 1.0) & (pull >= 0))
+        return Faced(point, cell, X, free, distances(x[point] - jets[0]))
+
+    def nearest(self, at: Faced, x: Array, nodal: Array) -> Faced:
+        """Of all places those from which the curve goes on to no nearer one, one on each side of a point."""
+        number = len(self.nodes)
+        order = np.argsort(at.point * number + at.cell)
+        at = at.of(order)
+        keys = at.point * number + at.cell
+        stays = np.ones(len(keys), dtype=bool)
+        for end, X in enumerate((0.0, 1.0)):
+            beyond = self.beside[at.cell, end]
+            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            listed = keys[there] == at.point * number + beyond
+            nearer = listed & (at.distance[there] < at.distance - SAME * self._h)
+            stays &= ~((at.X == X) & (beyond >= 0)) | (listed & ~nearer)
+        at = at.of(stays)
+        at = at.of(np.lexsort((at.distance, at.point)))
+        if not len(at.point):
+            return at
+        way = (x[at.point] - self.jets(at.X, nodal[at.cell])[0])[:, :2]
+        way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+        begins = np.flatnonzero(np.diff(at.point, prepend=-1))
+        first = np.repeat(begins, np.diff([*begins, len(way)]))
+        behind = np.sum(way * way[first], axis=1) < ALIKE
+        chosen = np.zeros(len(way), dtype=bool)
+        chosen[begins] = True
+        others = np.flatnonzero(behind)
+        chosen[others[np.flatnonzero(np.diff(at.point[others], prepend=-1))]] = True
+        return at.of(chosen)
+
+    def cell_normals(self) -> Array:
+        """(cells, 2) undeformed, of the straight lines between the ends."""
+        a, b = self._r0[self.nodes[:, 0]], self._r0[self.nodes[:, 1]]
+        n = np.column_stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]])
+        return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
+
+    def at_nodes(self, thickness: fem.Function) -> Array:
+        """What multiplies h at nodes, of cells with a node in common the mean by their lengths."""
+        t = thickness.x.array[thickness.function_space.dofmap.list]
+        return self._sum(self.speeds() * t) / self.lengths
+
+    @property
+    def lengths(self) -> Array:
+        """The sum (nodes,) of the speeds of all cells at a node."""
+        return self._sum(self.speeds())
+
+    def _sum(self, values: Array) -> Array:
+        return np.bincount(self.nodes.ravel(), values.ravel(), len(self._r0)).astype(float)
+
+    def speeds(self) -> Array:
+        """(cells, functions) lengths per that of the reference cell at the nodes, undeformed."""
+        return np.asarray(np.linalg.norm(self._along()[1], axis=2))
+
+    def by_speed(self) -> Array:
+        """The derivatives (cells, functions, functions, 2) of these by the nodes of the cell."""
+        table, along = self._along()
+        unit = along / np.linalg.norm(along, axis=2)[..., None]
+        return np.asarray(table[None, :, :, None] * unit[:, :, None])
+
+    def _along(self) -> tuple[Array, Array]:
+        table = self.table(1, self.element.points.ravel())[1]
+        return table, np.einsum("qk,cki->cqi", table, self._r0[self.nodes])

@@ -1,15 +1,16 @@
-"""How far faces of rubber are from the mid-surface: half the deformed thickness, a continuous function of the place.
+"""How far faces are from a mid-surface whose thickness varies or changes: half of it, continuous from cell to cell.
 
 At each node it is the undeformed volume per deformed area of the cells around, and between nodes their polynomial:
 
     H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell gets thinner as it stretches, J0 where it does not,
 
-with J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the natural volume, a polynomial of the
-amplitude "natural_stretch". The derivatives by the displacement and by this are exact.
+with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the
+natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by the displacement and by this are
+exact.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -18,28 +19,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
 from magshell_fenicsx.parts.touching.nearest import SIGNS, Cells, Longs, Places, inverse, jets, slopes
-
-if TYPE_CHECKING:
-    from magshell_fenicsx.parts.touching.touching import Touching
+from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ByGrowth:
-    """A derivative of the energy by the natural stretch, on which the thickness of faces depends."""
-
-    of: "Touching"
-    order: int = 1
-    amplitude: str | None = None
-
-    def energy(self) -> float:
-        """On this rank's part."""
-        return self.of.by_growth(self.order)
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first one; collective."""
-        self.of.add_by_growth(b, factor)
 
 
 @dataclass(frozen=True)
@@ -87,6 +69,8 @@ class Faces:
     ----------
     grown
         The same.
+    undeformed
+        Half the undeformed thickness (nodes,) over R, before anything grows.
     """
 
     def __init__(
@@ -104,7 +88,10 @@ class Faces:
         self._table = cells.element.tabulate(1, cells.element.points)[1:, :, :, 0]
         J0 = self._areas(r0, slice(None))
         self._volumes = h / 2 * np.array([self._sum(slice(None), each * J0) for each in thickness])
+        self._thickness = thickness[0]
+        self._per_factor = h / 2 * thickness / thickness[0]  # by powers of the amplitude
         self._stays = self._sum(~thins, J0[~thins])
+        self.undeformed = np.asarray(self._volumes[0] / self._sum(slice(None), J0))
 
     @property
     def value(self) -> float:
@@ -121,12 +108,39 @@ class Faces:
 
     def slope(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
+        if not len(self._thin):
+            return np.zeros_like(u)
         return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(-1, 3))
 
     def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
         area = self._area(u)
         return scipy.sparse.diags_array(np.where(which, -self._volume() / area**2, 0.0)) @ self._slopes(u, which)
+
+    def change(self, u: Array, w: Array) -> Array:
+        """What H (nodes,) changes by along w (nodes, 3)."""
+        return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel() if len(self._thin) else 0 * u[:, 0])
+
+    def ratio(self, u: Array) -> tuple[Array, Array]:
+        """The volumes and areas (nodes,) whose ratio is H."""
+        return self._volume(), self._area(u)
+
+    def by_factor(self, by_volume: Array) -> Array:
+        """The derivatives (cells, functions) by what multiplies h, of those (nodes,) by volumes."""
+        at_places = np.bincount(self._same, by_volume, len(by_volume))[self._places]
+        per_factor = np.polynomial.polynomial.polyval(self.value, self._per_factor)
+        return np.asarray(at_places * per_factor * self._areas(self._r0, slice(None)))
+
+    def by_area(self, by_volume: Array, by_area: Array) -> Array:
+        """Those (nodes, 3) by the undeformed place, as far as volumes and areas that stay depend on it alone."""
+        of_volume, of_area = (np.bincount(self._same, f, len(f))[self._places] for f in (by_volume, by_area))
+        h_t = np.polynomial.polynomial.polyval(self.value, self._per_factor) * self._thickness
+        by_J0 = of_volume * h_t + of_area * ~self._thins[:, None]
+        some = np.flatnonzero((by_J0 != 0).any(axis=1))
+        slope = self._tilted(0 * self._r0, some).slope
+        forces = np.zeros(self._r0.size)
+        np.add.at(forces, unknowns(self._cells.nodes[some], len(self._r0)), np.einsum("cq,cqm->cm", by_J0[some], slope))
+        return forces.reshape(-1, 3)
 
     def slope_by_growth(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f dH, with dH by the amplitude."""
@@ -161,6 +175,9 @@ class Faces:
         """
         rows, columns, values = entries
         size, count = 4 * len(f), 3 * len(f)
+        if not len(self._thin):  # H stays
+            of_places = (rows < count) & (columns < count)
+            return rows[of_places], columns[of_places], values[of_places]
         which = np.zeros(size, dtype=bool)
         which[rows] = True
         by_u = scipy.sparse.vstack([scipy.sparse.eye_array(count), self.jacobian(u, which[count:])]).tocsr()
@@ -170,6 +187,8 @@ class Faces:
 
     def around(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
         """Pairs of nodes that act on each other, where places and thickness at pairs of nodes do."""
+        if not len(self._thin):
+            return rows, columns
         nodes, count = self._places, len(self._r0)
         has = np.repeat(np.arange(len(nodes)), nodes.shape[1])
         cells = scipy.sparse.coo_array((np.ones(nodes.size), (has, nodes.ravel())), (len(nodes), count)).tocsr()
@@ -276,3 +295,32 @@ def hessians(
     for i in range(3):
         H[:, i::parts, i::parts] -= both
     return np.asarray(H)
+
+
+def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int) -> Entries:
+    """What the Hessian of joined places has besides those of each.
+
+    Parameters
+    ----------
+    slopes, nodes, group
+        Of all places: the weighted derivative (n, functions, parts) of the distance by the nodes (n, functions) of
+        `count`, and the joined one (n,) that it belongs to.
+    weight
+        Of each joined one.
+    """
+    parts = slopes.shape[2]
+    dofs = unknowns(nodes, count, parts)
+    entries = slopes.ravel(), (np.repeat(group, dofs.shape[1]), dofs.ravel())
+    G = scipy.sparse.coo_array(entries, (len(weight), parts * count)).tocsr()
+    hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
+    return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
+
+
+def geometry(cells: Cells, points: Points, r: Array, at: Places) -> tuple[Array, Array, Array, Longs]:
+    """Distances, normals, and beta (n, functions of both cells) with its nodes, where all nodes are at r."""
+    nodes = np.concatenate([cells.nodes[points.cell[at.point]], cells.nodes[at.cell]], axis=1)
+    half, N = nodes.shape[1] // 2, points.shape[at.point]
+    (shape, y), *_ = jets(cells.element, at.X, r[nodes[:, half:]], 0)
+    off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
+    d = np.linalg.norm(off, axis=1)
+    return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes

@@ -54,7 +54,7 @@ class Facing:
     r0
         (nodes, 3) undeformed.
     faces
-        How far they are from the mid-surface where the thickness changes with the state; None where it does not.
+        How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
     """
 
     def __init__(
@@ -69,11 +69,14 @@ class Facing:
     ) -> None:
         self._cells, self._rule, self._allowed, self._h = cells, rule, allowed, h
         self._r0, self._faces, self._comm = r0, faces, comm
-        self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self.half: Array = faces.undeformed if faces else np.full(len(r0), h / 2)  # undeformed, at all nodes
+        self._thickest = 2 * float(self.half.max())
+        self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
-        """All nodes, with half of what the thickness gains as a fourth component if it changes; see `nearest`."""
+        """All nodes, with what half the thickness is more than h/2 as a fourth component if it is another one; see
+        `nearest`."""
         r = self._r0 + u
         return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
 
@@ -88,7 +91,8 @@ class Facing:
         centres = (both[0][0] + both[1][0]) / 2
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
-        near = self._fit(*near_pairs(centres, radii, self._h), self._h, self._r0 + u, self._r0 + v)
+        far = self._thickest
+        near = self._fit(*near_pairs(centres, radii, far), far, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -138,7 +142,8 @@ class Facing:
                 between = BETWEEN / self._cells.element.degree
                 apart = between * (radii[i[some]] + radii[j[some]])
                 before = between * (wide[i[some]] + wide[j[some]])
-                near = (now < far + apart[:, None, None]) & (way > BESIDE * self._h - before[:, None, None])
+                least = BESIDE * (self.half[one] + self.half[other])
+                near = (now < far + apart[:, None, None]) & (way > least - before[:, None, None])
                 found[some] = near.any(axis=(1, 2))
         return found
 
@@ -217,8 +222,14 @@ class Facing:
         (_, y), *_ = jets(self._cells.element, asked.X, self._r0[self._cells.nodes[asked.cell]], 0)
         way = np.linalg.norm(self.x_of(points, self._r0, asked.point) - y, axis=1)
         stays = ~beside
-        stays[beside] = (way > BESIDE * self._h) & self._above(points, asked, r)
+        stays[beside] = (way > BESIDE * self.thickness(points, asked)) & self._above(points, asked, r)
         return at.of(stays)
+
+    def thickness(self, points: Points, at: Places) -> Array:
+        """The mean undeformed thickness (n,) at points and their places, over R."""
+        (_, there), *_ = jets(self._cells.element, at.X, self.half[self._cells.nodes[at.cell]][..., None], 0)
+        here = np.sum(points.shape[at.point] * self.half[self._cells.nodes[points.cell[at.point]]], axis=1)
+        return np.asarray(here + there[:, 0])
 
     def _facing(self, points: Points, at: Places, r: Array) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point

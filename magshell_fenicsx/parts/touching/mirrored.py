@@ -136,3 +136,9 @@ class Mirrored(Touching):
 
     def _of_copies(self, u: Array) -> Array:
         return self._images.moved(u)
+
+    def _in_modelled(self, values: Array) -> Array:
+        return np.asarray(values.reshape(len(self._images.images), -1, values.shape[1]).sum(axis=0))
+
+    def _on_modelled(self, forces: Array) -> Array:
+        return self._images.forces(forces.ravel()).reshape(-1, 3)

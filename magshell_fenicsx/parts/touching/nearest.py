@@ -3,8 +3,8 @@
 A point of a surface is near the material around itself, which it does not touch. So a cell counts only if the way to it
 within the undeformed surface is long.
 
-Where the thickness changes with the state, vectors have a fourth component: half the thickness less the undeformed one,
-of x with the other sign. The distance is then that of the faces and h: |x - y| of the three, and the fourth of x - y.
+Where the thickness varies, or changes with the state, vectors have a fourth component: half of it less h/2, of x with
+the other sign. The distance is then that of the faces and h: |x - y| of the three, and the fourth of x - y.
 """
 
 from collections.abc import Iterator
@@ -112,17 +112,19 @@ class Cells:
         _, fine = self.lattices[-1]
         return float(np.abs(fine).sum(axis=1).max())
 
-    def near_in_surface(self, r0: Array, far: float) -> Longs:
-        """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than `far`.
+    def near_in_surface(self, r0: Array, far: Array) -> Longs:
+        """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than the mean of
+        `far` at its ends.
 
         Parameters
         ----------
-        r0
-            (nodes, 3) undeformed.
+        r0, far
+            (nodes, 3) undeformed, and (nodes,).
         """
         count, n = int(self.corners.max()) + 1, len(self.corners)
-        x = np.zeros((count, 3))
-        x[self.corners] = self.at_corners @ r0[self.nodes]
+        x, reach = np.zeros((count, 3)), np.zeros(count)
+        x[self.corners], reach[self.corners] = self.at_corners @ r0[self.nodes], far[self.nodes] @ self.at_corners.T
+        farthest = float(reach.max())
         a, b = (np.concatenate([self.corners[:, c] for c in of]) for of in ((0, 1, 2), (1, 2, 0)))
         ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
         ways = ways.tocoo()
@@ -132,11 +134,11 @@ class Cells:
         order = np.argsort(x[:, axis], kind="stable")
         near = list[tuple[Longs, Longs]]()
         for some in np.array_split(order, max(1, count // STRIP)):  # a way that short leaves a strip by no more
-            low, high = x[some[0], axis] - far, x[some[-1], axis] + far
+            low, high = x[some[0], axis] - farthest, x[some[-1], axis] + farthest
             around = order[np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")]
             inside = np.flatnonzero(np.isin(around, some))
-            reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=far)
-            row, column = np.nonzero(np.isfinite(reached))
+            reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=farthest)
+            row, column = np.nonzero(reached <= (reach[around[inside], None] + reach[around]) / 2)
             near.append((around[inside[row]], around[column]))
         i, j = (np.concatenate(each) for each in zip(*near, strict=True))
         between = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()

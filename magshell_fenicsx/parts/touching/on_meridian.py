@@ -5,6 +5,10 @@ penalty. With d = |x - y|, n = (x - y)/d, F = d^2/2, A = F,ss = |y'|^2 - (x - y)
 
     d,uu = [D . D - (n . D)^2 - C_s^2/A - C_theta^2/B]/d,   C_s = -D . y' - (x - y) . dy',   B = rho_x rho_y
 
+Where the thickness varies d is the least of |x - y| - H(y), less H(x), plus h, with half the thickness H. Then n . y'
+is -H', C_s has y' less its part along n, and A is |y'|^2 - (x - y) . y'' - H'^2 - |x - y| H''. H less h/2 is a third
+component of places.
+
 Along e_theta the nearest place moves as it does along the curve. A wave (U cos, V sin, W cos) of m theta moves it by
 C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves it stays. The points are those of a
 rule on each cell. At a free end one is next to the end, which an edge stands on.
@@ -22,19 +26,16 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
-from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
-from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
+from magshell_fenicsx.parts.touching.curves import SIGNS, Curves, Faced, distances, nowhere, slopes
+from magshell_fenicsx.parts.touching.facing import STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, FOLLOWING, ROUNDS
-from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
+from magshell_fenicsx.parts.touching.nearest import BULGE, FOLLOWING
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
-START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
-SAME = 1e-9  # of h: places of two cells at the same distance are one
 
 
 class MeridianTouching:
@@ -44,33 +45,45 @@ class MeridianTouching:
     ----------
     sides
         Whether each cell belongs to the first shell, and to the second.
+    h
+        Thickness over R: that of the penalty and of the search where it varies.
     degree
         Of the quadrature.
+    thickness
+        What multiplies h, (1,); None for 1.
     """
 
     amplitude, column = None, ""
 
     def __init__(
-        self, pair: Pair, r0: fem.Function, u: fem.Function, sides: tuple[Inside, Inside], h: float, degree: int
+        self,
+        pair: Pair,
+        r0: fem.Function,
+        u: fem.Function,
+        sides: tuple[Inside, Inside],
+        h: float,
+        degree: int,
+        thickness: fem.Function | None = None,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self.group = self.name
         self.stiffness = Number(pair.stiffness)
-        self._h, self._u = pair.thickness * h, u
+        self._h, self._u, self._placement, self._thickness = h, u, r0, thickness
         V = r0.function_space
         self._nodes = V.dofmap.list.astype(np.int64)
-        self._element, self._r0 = V.element.basix_element, np.array(r0.x.array.reshape(-1, 2))
-        self._sides, self._beside = sides, beside(self._nodes)
-        self._rule = self._points(degree // 2 + 1)
-        self._normals = self._cell_normals()
+        self._sides, self._r0 = sides, np.array(r0.x.array.reshape(-1, 2))
+        self._curves = Curves(V.element.basix_element, self._nodes, self._r0, h)
+        self._rule = self._curves.rule(degree // 2 + 1, sides)
+        self._normals = self._curves.cell_normals()
+        self._half = h / 2 * (np.ones(len(self._r0)) if thickness is None else self._curves.at_nodes(thickness))
+        of_both = self._half[self._nodes[np.any(sides, axis=0)]]
+        self._thinnest, self._far = 2 * float(of_both.min()), h + (REACH - 1) * 2 * float(of_both.max())
         self._at: Array = np.full_like(self._r0, np.nan)
         self._places = nowhere()
         self.looks: Sequence[Look] = ()  # see `InSteps`
         self.look: Look | None = None
         self._looked_at = Kept[tuple[Array, Faced]]()
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
-        k = self._element.degree
-        self._start = np.linspace(0.0, 1.0, START * k + 1, dtype=np.float64)
 
     # as a term
 
@@ -134,6 +147,60 @@ class MeridianTouching:
         H[..., 1::3] -= H[..., ::3]
         return _entries(H / 2, nodes, 3)
 
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Of thickness and placement; see `assembly.coupled.KnowsFields` and `by_fields`."""
+        field = {"thickness": self._thickness, "r0": self._placement}.get(name)
+        if field is None:
+            return None
+        w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
+        by_half = self._by_half(w, energy, force)[self._nodes]
+        speeds, lengths = self._curves.speeds(), self._curves.lengths[self._nodes]
+        if name == "thickness":
+            return field, (by_half * self._h / 2 * speeds / lengths)[..., None]
+        rows, columns, values = self._entries()
+        stiff = np.bincount(rows, values * w.ravel()[columns], w.size).reshape(-1, 2)
+        nodal = energy * self._forces() + force * stiff + self._by_weights(w, energy, force)
+        if self._thickness is not None:
+            t = self._thickness.x.array[self._thickness.function_space.dofmap.list]
+            by_speed = by_half * (self._h / 2 * t - self._half[self._nodes]) / lengths
+            np.add.at(nodal, self._nodes, np.einsum("cq,cqki->cki", by_speed, self._curves.by_speed()))
+        count = np.bincount(self._nodes.ravel(), minlength=len(nodal))
+        return field, np.asarray((nodal / count[:, None])[self._nodes])
+
+    def _by_half(self, w: Array, energy: float, force: float) -> Array:
+        """By half the thickness at nodes (nodes,), of energy Pi + force w . Pi,u."""
+        at, by_half = self._pressed(), np.zeros(len(self._r0))
+        _, first, second = self._penalty(at)
+        off, n, beta, nodes = self._geometry(at)
+        count, functions = beta.shape
+        half, weight = functions // 2, self._rule.weight[at.point] / 2
+        normal, slide, A = self._rows(at, off, n, beta)
+        along = np.insert(w, 1, 0.0, axis=1)[nodes].reshape(count, -1)
+        farther, slid = (np.sum(row.reshape(count, -1) * along, axis=1) for row in (normal, slide))
+        thicker = np.concatenate([beta[:, :half], -beta[:, half:]], axis=1)
+        forces = (weight * (energy * first - force * second * farther))[:, None] * thicker
+        turned = np.where(at.free, slid / np.where(at.free, A, 1.0), 0.0)
+        forces[:, half:] -= (force * weight * first * turned)[:, None] * self._curves.table(1, at.X)[1]
+        np.add.at(by_half, nodes, forces)
+        return by_half
+
+    def _by_weights(self, w: Array, energy: float, force: float) -> Array:
+        """By the undeformed places of nodes (nodes, 2), as far as the weights of points depend on them."""
+        at, nodal = self._pressed(), np.zeros_like(self._r0)
+        value, first, _ = self._penalty(at)
+        _, n, beta, nodes = self._geometry(at)
+        farther = np.einsum("nk,ni,nki->n", beta, n, w[nodes])
+        per_weight = self._rule.weight[at.point] / 2 * (energy * value - force * first * farther)
+        own = self._nodes[self._rule.cell[at.point]]
+        shape, slope = self._curves.table(1, self._rule.shape[at.point] @ self._curves.element.points.ravel())
+        (rho, _), tangent = (np.einsum("nk,nki->in", table, self._r0[own]) for table in (shape, slope))
+        forces = slope[..., None] * (tangent / np.sum(tangent * tangent, axis=0)).T[:, None]
+        forces[..., 0] += shape / rho[:, None]
+        np.add.at(nodal, own, per_weight[:, None, None] * forces)
+        return nodal
+
     # what is seen
 
     def force(self) -> float:
@@ -143,15 +210,22 @@ class MeridianTouching:
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach."""
-        least = self._found(self._now(), REACH * self._h).distance.min(initial=np.inf)
+        least = self._found(self._now(), self._far).distance.min(initial=np.inf)
         return float(least - self._h) if np.isfinite(least) else np.nan
 
     def penetration(self) -> float:
         """The largest, over R; 0 where nothing touches."""
         return float((self._h - self._pressed().distance).max(initial=0.0))
 
-    def refuse_overlap(self, h: float) -> None:
-        """See that the shells do not overlap undeformed; `h` is that of the first one.
+    def depth(self) -> float:
+        """The same over the thickness there."""
+        at, half = self._pressed(), self._half[self._nodes]
+        here = np.sum(self._rule.shape[at.point] * half[self._rule.cell[at.point]], axis=1)
+        there = np.sum(self._curves.table(0, at.X)[0] * half[at.cell], axis=1)
+        return float(((self._h - at.distance) / (here + there)).max(initial=0.0))
+
+    def refuse_overlap(self) -> None:
+        """See that the shells do not overlap undeformed.
 
         Raises
         ------
@@ -162,7 +236,7 @@ class MeridianTouching:
         deep = self._h - at.distance
         if len(deep) and deep.max() > WITHIN * self._h:
             rho, z = self._x_of(self._r0)[at.point[int(deep.argmax())]]
-            where, by = f"{rho:.4g}, 0, {z:.4g}", deep.max() / h
+            where, by = f"{rho:.4g}, 0, {z:.4g}", deep.max() / self._h
             raise MeshError(
                 f"contact: {self.pair.words} overlap undeformed, by {by:.4g} h at ({where}) R: move them apart"
             )
@@ -173,20 +247,21 @@ class MeridianTouching:
         cell, weight = self._rule.cell, self._rule.weight
         area = np.bincount(cell, weight, count)
         force = np.bincount(cell[at.point], weight[at.point] * self._penalty(at)[1], count)
-        gap = np.full(count, (REACH - 1) * self._h)
-        near = self._found(self._now(), REACH * self._h)
+        gap = np.full(count, self._far - self._h)
+        near = self._found(self._now(), self._far)
         np.minimum.at(gap, cell[near.point], near.distance - self._h)
         return force / np.where(area > 0, area, 1.0), gap
 
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a curve on the straight way between two displacements (nodes, 2).
 
-        Between two looks none moves, relative to another, by more than a part of the thickness.
+        Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
-        moved = v - u
+        moved, least = v - u, self._thinnest
         moved = moved - [0.0, moved[:, 1].mean()]
-        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * self._h)))
-        return any(len(self._found(u + k / looks * (v - u), NEARER * self._h).point) for k in range(1, looks))
+        looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
+        ways = (u + k / looks * (v - u) for k in range(1, looks))
+        return any(len(self._found(way, NEARER * least, faces=False).point) for way in ways)
 
     # in a step in time, see `in_steps.InSteps`
 
@@ -241,47 +316,30 @@ class MeridianTouching:
 
     def _followed(self, at: Faced) -> Faced:
         """Places after a small change, free ones also beyond an end of their cells."""
-        r, X = self._r0 + self._at, at.X
+        r, X = self._placed(self._at), at.X
         x, nodal = self._x_of(r)[at.point], r[self._nodes[at.cell]]
         for _ in range(FOLLOWING):
-            y, first, second = self._jets(X, nodal)
-            off = x - y
-            bent = np.sum(first * first - off * second, axis=1)
-            X = X + np.where(at.free, np.sum(off * first, axis=1) / np.where(at.free, bent, 1.0), 0.0)
-        return replace(at, X=X, distance=np.linalg.norm(x - self._jets(X, nodal)[0], axis=1))
+            pull, bent, _ = slopes(x, self._curves.jets(X, nodal))
+            X = X + np.where(at.free, pull / np.where(at.free, bent, 1.0), 0.0)
+        return replace(at, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
 
-    def _points(self, count: int) -> Rule:
-        """So many Gauss's points in each cell, in those with a free end the end among them."""
-        ends = (self._beside < 0) & (np.abs(self._r0[self._nodes[:, :2], 0]) > SAME)
-        parts = list[tuple[Longs, Array, Array, Inside, Array, Inside]]()
-        for begins, last in ((False, False), (True, False), (False, True), (True, True)):
-            cells = np.flatnonzero(np.any(self._sides, axis=0) & (ends == [begins, last]).all(axis=1))
-            X, w = rule_on_line(count, begins, last)
-            table = self._table(1, X)
-            x, along = np.einsum("dqk,cki->dcqi", table, self._r0[self._nodes[cells]])
-            speed = np.linalg.norm(along, axis=2)
-            area = 2 * np.pi * x[..., 0] * speed * w
-            normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
-            on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
-            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
-            parts.append((cell, shape, area.ravel(), self._sides[0][cell], normal.reshape(-1, 2), on_edge))
-        return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
-    def _cell_normals(self) -> Array:
-        """(cells, 2) undeformed, of the straight lines between the ends."""
-        a, b = self._r0[self._nodes[:, 0]], self._r0[self._nodes[:, 1]]
-        n = np.column_stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]])
-        return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
+    def _placed(self, u: Array, *, faces: bool = True) -> Array:
+        """All nodes (nodes, 3), with half the thickness less h/2, or nothing, as the third component."""
+        return np.column_stack([self._r0 + u, (self._half - self._h / 2) * faces])
 
     def _x_of(self, r: Array) -> Array:
-        return np.asarray(np.einsum("nk,nki->ni", self._rule.shape, r[self._nodes[self._rule.cell]]))
+        """The points, with the third component of the other sign, see `distances`."""
+        nodal = r[self._nodes[self._rule.cell]] * SIGNS[: r.shape[1]]
+        return np.asarray(np.einsum("nk,nki->ni", self._rule.shape, nodal))
 
-    def _found(self, u: Array, reach: float) -> Faced:
-        """The places that points face within a distance at a displacement: one on each side of a point at most."""
-        r, rule = self._r0 + u, self._rule
+    def _found(self, u: Array, of_faces: float, *, faces: bool = True) -> Faced:
+        """The places that points face within a distance of faces or mid-surfaces at a displacement: one on each side of
+        a point at most."""
+        r, rule = self._placed(u, faces=faces), self._rule
+        reach = of_faces + 2 * float(r[:, 2].max())
         x, nodal = self._x_of(r), r[self._nodes]
-        centres = nodal.mean(axis=1)
-        radii = BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+        centres = nodal[..., :2].mean(axis=1)
+        radii = BULGE * np.linalg.norm(nodal[..., :2] - centres[:, None], axis=2).max(axis=1)
         parts = list[tuple[Longs, Longs]]()
         for mine, others in zip((rule.first, ~rule.first), self._sides[::-1], strict=True):
             near, cells = np.unique(rule.cell[mine]), np.flatnonzero(others)
@@ -289,62 +347,14 @@ class MeridianTouching:
             within = np.zeros(len(nodal), dtype=bool)
             within[near] = (far < radii[near][:, None]).any(axis=1)
             points, cells = np.flatnonzero(mine & within[rule.cell]), cells[(far < radii[near][:, None]).any(axis=0)]
-            away = np.linalg.norm(x[points][:, None] - centres[cells], axis=2)
+            away = np.linalg.norm(x[points, None, :2] - centres[cells], axis=2)
             i, j = np.nonzero(away < radii[cells] + reach)
             parts.append((points[i], cells[j]))
         point, cell = (np.concatenate(each) for each in zip(*parts, strict=True))
         if not len(point):
             return nowhere()
-        at = self._projected(x, nodal, point, cell)
-        return self._nearest(at.of(at.distance < reach), x, nodal)
-
-    def _projected(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> Faced:
-        """The nearest place of each cell, by Newton's method from the nearest of some."""
-        shape = self._table(0, self._start)[0]
-        off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
-        X = self._start[np.einsum("nmi,nmi->nm", off, off).argmin(axis=1)]
-        for _ in range(ROUNDS):
-            y, first, second = self._jets(X, nodal[cell])
-            off, speed = x[point] - y, np.sum(first * first, axis=1)
-            bent = speed - np.sum(off * second, axis=1)
-            step = np.sum(off * first, axis=1) / np.where(bent > FLAT * speed, bent, speed)
-            after = np.clip(X + np.clip(step, -0.25, 0.25), 0.0, 1.0)
-            moved, X = np.abs(after - X).max(initial=0.0), after
-            if moved < EXACT:
-                break
-        y, first, _ = self._jets(X, nodal[cell])
-        off = x[point] - y
-        pull = np.sum(off * first, axis=1)
-        free = ~((X == 0.0) & (pull <= 0) | (X == 1.0) & (pull >= 0))
-        return Faced(point, cell, X, free, np.linalg.norm(off, axis=1))
-
-    def _nearest(self, at: Faced, x: Array, nodal: Array) -> Faced:
-        """Of all places those from which the curve goes on to no nearer one, one on each side of a point."""
-        number = len(self._nodes)
-        order = np.argsort(at.point * number + at.cell)
-        at = at.of(order)
-        keys = at.point * number + at.cell
-        stays = np.ones(len(keys), dtype=bool)
-        for end, X in enumerate((0.0, 1.0)):
-            beyond = self._beside[at.cell, end]
-            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
-            listed = keys[there] == at.point * number + beyond
-            nearer = listed & (at.distance[there] < at.distance - SAME * self._h)
-            stays &= ~((at.X == X) & (beyond >= 0)) | (listed & ~nearer)
-        at = at.of(stays)
-        at = at.of(np.lexsort((at.distance, at.point)))
-        if not len(at.point):
-            return at
-        way = x[at.point] - self._jets(at.X, nodal[at.cell])[0]
-        way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
-        begins = np.flatnonzero(np.diff(at.point, prepend=-1))
-        first = np.repeat(begins, np.diff([*begins, len(way)]))
-        behind = np.sum(way * way[first], axis=1) < ALIKE
-        chosen = np.zeros(len(way), dtype=bool)
-        chosen[begins] = True
-        others = np.flatnonzero(behind)
-        chosen[others[np.flatnonzero(np.diff(at.point[others], prepend=-1))]] = True
-        return at.of(chosen)
+        at = self._curves.projected(x, nodal, point, cell)
+        return self._curves.nearest(at.of(at.distance < of_faces), x, nodal)
 
     def _left_to_edges(self, at: Faced) -> Inside:
         """Which places do not count: those of points inside a shell that face the end of another one, steeply.
@@ -353,28 +363,29 @@ class MeridianTouching:
         energy is a function of the state.
         """
         end = (at.X == 1.0).astype(np.int64)
-        at_end = ~at.free & (self._beside[at.cell, end] < 0)
+        at_end = ~at.free & (self._curves.beside[at.cell, end] < 0)
         level = np.abs(np.sum(self._rule.normal[at.point] * self._normals[at.cell], axis=1))
         return np.asarray(at_end & (level < STEEP) & ~self._rule.on_edge[at.point])
-
-    def _jets(self, X: Array, nodal: Array) -> Array:
-        """(3, n, 2): places and two derivatives, of the curves through nodes (n, functions, 2)."""
-        return np.asarray(np.einsum("dnk,nki->dni", self._table(2, X), nodal))
-
-    def _table(self, order: int, X: Array) -> Array:
-        """Shape functions and derivatives (order + 1, n, functions); basix takes no empty X."""
-        if not len(X):
-            return np.zeros((order + 1, 0, self._nodes.shape[1]))
-        return np.asarray(self._element.tabulate(order, X[:, None])[..., 0])
 
     def _geometry(self, at: Faced) -> tuple[Array, Array, Array, Longs]:
         """x - y, n, and beta (n, functions of both cells) with its nodes."""
         nodes = np.concatenate([self._nodes[self._rule.cell[at.point]], self._nodes[at.cell]], axis=1)
         r = self._r0 + self._at
-        N, shape = self._rule.shape[at.point], self._table(0, at.X)[0]
+        N, shape = self._rule.shape[at.point], self._curves.table(0, at.X)[0]
         beta = np.concatenate([N, -shape], axis=1)
         off = np.einsum("nk,nki->ni", beta, r[nodes])
         return off, off / np.linalg.norm(off, axis=1)[:, None], beta, nodes
+
+    def _rows(self, at: Faced, off: Array, n: Array, beta: Array) -> tuple[Array, Array, Array]:
+        """By (U, V, W) at the nodes of both cells, (n, functions, 3): d,u, and C_s; and A (n,)."""
+        r = self._placed(self._at)
+        jets, half = self._curves.jets(at.X, r[self._nodes[at.cell]]), beta.shape[1] // 2
+        along = jets[1, :, :2] - np.sum(jets[1, :, :2] * n, axis=1)[:, None] * n
+        normal, slide = np.zeros((2, *beta.shape, 3))
+        normal[..., ::2] = beta[..., None] * n[:, None]
+        slide[..., ::2] = -beta[..., None] * along[:, None]
+        slide[:, half:, ::2] -= self._curves.table(1, at.X)[1][..., None] * off[:, None]
+        return normal, slide, slopes(self._x_of(r)[at.point], jets)[1]
 
     def _second(self, m: float) -> tuple[Array, Longs]:
         """(n, dofs, dofs) by (U, V, W) at the nodes of both cells, over the whole circumference."""
@@ -382,21 +393,17 @@ class MeridianTouching:
         _, first, second = self._penalty(at)
         off, n, beta, nodes = self._geometry(at)
         count, functions = beta.shape
-        half, d = functions // 2, at.distance
+        half, d = functions // 2, np.linalg.norm(off, axis=1)
         weight = self._rule.weight[at.point] / 2
         bent = -weight * first / d
-        y, along, curved = self._jets(at.X, (self._r0 + self._at)[self._nodes[at.cell]])
-        slopes = self._table(1, at.X)[1]
-        normal, slide, turn = (np.zeros((count, functions, 3)) for _ in range(3))
-        normal[..., ::2] = beta[..., None] * n[:, None]
-        slide[..., ::2] = -beta[..., None] * along[:, None]
-        slide[:, half:, ::2] -= slopes[..., None] * off[:, None]
+        normal, slide, A = self._rows(at, off, n, beta)
+        y = self._curves.jets(at.X, (self._r0 + self._at)[self._nodes[at.cell]])[0]
+        turn = np.zeros((count, functions, 3))
         turn[..., 1] = -beta * y[:, :1]
         shape = -beta[:, half:]
         turn[:, half:, 0] += m * off[:, :1] * shape
         turn[:, half:, 1] += off[:, :1] * shape
         turn[:, half:, 2] += m * off[:, 1:] * shape
-        A = np.sum(along * along - off * curved, axis=1)
         B = y[:, 0] * (y[:, 0] + off[:, 0])
         inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
         rows = np.stack([each.reshape(count, 3 * functions) for each in (normal, slide, turn)], axis=1)
@@ -409,9 +416,15 @@ class MeridianTouching:
 
 
 def touchings(
-    pairs: Sequence[Pair], r0: fem.Function, u: fem.Function, patches: Mapping[str, Inside], h: float, degree: int
+    pairs: Sequence[Pair],
+    r0: fem.Function,
+    u: fem.Function,
+    patches: Mapping[str, Inside],
+    h: float,
+    degree: int,
+    thickness: fem.Function | None = None,
 ) -> list[MeridianTouching]:
-    """The contacts of pairs of shells.
+    """The contacts of pairs of shells; of `thickness` see `MeridianTouching`.
 
     Raises
     ------
@@ -421,8 +434,8 @@ def touchings(
     made = list[MeridianTouching]()
     for pair in pairs:
         one, other = (patches[name] for name in pair.names)
-        made.append(MeridianTouching(pair, r0, u, (one, other), h, degree))
-        made[-1].refuse_overlap(h)
+        made.append(MeridianTouching(pair, r0, u, (one, other), h, degree, thickness))
+        made[-1].refuse_overlap()
     return made
 
 

@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.step import ProgrammeStep
     from magshell_fenicsx.shape.outline import Outline
 
-Value = TypeVar("Value")
 WHOLE = "shell"
 KEEP_THICKNESS = ("koiter", "laminate")  # laws
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
@@ -39,16 +37,13 @@ class Pair:
     stiffness
         k of the penalty, over E h/R^2.
     bound
-        Largest penetration that is allowed, over h.
-    thickness
-        The mean of both thicknesses over h.
+        Largest penetration that is allowed, over the thickness there.
     """
 
     names: tuple[str, str]
     suffix: str
     stiffness: float
     bound: float = 1e-3
-    thickness: float = 1.0
 
     @property
     def setting(self) -> str:
@@ -75,7 +70,7 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         refuse_unfit_pairs(self.given, context)
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """All planes: a half sees its image. The meridian where shells of constant thickness touch each other."""
+        """All planes: a half sees its image. The meridian where shells that keep their thickness touch each other."""
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         names, laws = {name for pair in self.given for name in pair}, several.laws if several else {}
         why = None
@@ -87,29 +82,16 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        thicknesses, moduli = (several.thicknesses, several.moduli) if several else ({}, {})
-        return {"pairs": pairs(self.given, context.shell.poisson_ratio, thicknesses, moduli)}
+        return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.moduli if several else {})}
 
 
-def pairs(
-    given: Sequence[Sequence[str]],
-    nu: float,
-    thickness: Mapping[str, float | None],
-    moduli: Mapping[str, float] | None = None,
-) -> tuple[Pair, ...]:
+def pairs(given: Sequence[Sequence[str]], nu: float, moduli: Mapping[str, float]) -> tuple[Pair, ...]:
     """What a case's pairs are in a model.
 
     Parameters
     ----------
-    thickness
-        Of several shells: name -> thickness over h, None where it varies.
     moduli
         Of several shells: name -> Young's modulus over E; the penalty is that of the softer one.
-
-    Raises
-    ------
-    CaseError
-        If the faces of a pair are not one distance from their mid-surfaces.
     """
     k = STIFF / (12 * (1 - nu**2))
     several = len(given) > 1
@@ -117,30 +99,15 @@ def pairs(
         Pair(
             (one, other),
             f"_{one}_{other}" if several else "",
-            k * min([*_of_shells(one, moduli or {}), *_of_shells(other, moduli or {})], default=1.0),
-            thickness=_mean(i, (one, other), thickness),
+            k * min([*_of_shells(one, moduli), *_of_shells(other, moduli)], default=1.0),
         )
-        for i, (one, other) in enumerate(given)
+        for one, other in given
     )
 
 
-def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
+def _of_shells(name: str, values: Mapping[str, float]) -> list[float]:
     """The values of all shells, of the shell with this name, or of the shell that has this patch."""
     return [value for shell, value in values.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
-
-
-def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None]) -> float:
-    """The mean thickness of a pair over h; a patch is as thick as its shell."""
-    found = list[float]()
-    for name in pair if thickness else ():
-        of = _of_shells(name, thickness)
-        if None in of or len({*of}) > 1:
-            raise CaseError(
-                f"contact.{number}: {name}: needs the same thickness everywhere: leave out thickness_factor, and name "
-                "shells of different thickness one by one"
-            )
-        found += [t for t in of[:1] if t is not None]
-    return sum(found) / len(found) if found else 1.0
 
 
 def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None:
@@ -163,7 +130,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
                 raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
-    context.needs("contact", "a mid-surface", "the same thickness everywhere")
+    context.needs("contact", "a mid-surface")
     for step in context.steps:
         _refuse_step(step, context)
 

@@ -44,7 +44,7 @@ class TouchingSeen(Seen):
         Quantity(
             "contact_penalty",
             "stiffness between shells",
-            "Of the penalty, in E h/R²; raised fourfold where shells would penetrate by more than 1e-3 h.",
+            "Of the penalty, in E h/R²; raised fourfold where shells would penetrate by over 1e-3 of the thickness.",
             "error",
             each=True,
         ),

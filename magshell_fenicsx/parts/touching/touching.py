@@ -12,28 +12,28 @@ With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distanc
 where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
 Springer 2006, sec. 4.1 and 9.
 
-Shells that get thinner have half the thickness H at nodes as a fourth unknown: d is then the least of |x - y| - H(y),
-less H(x), plus h, so that |x - y| need not be the least. H follows from the displacement (`Faces`).
+Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of |x - y| - H(y), less H(x),
+plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.connected import add_own
+from magshell_fenicsx.assembly.connected import add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
-from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Twice
+from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place, with_growth
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import ByGrowth, Faces, hessians, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places, jets
+from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 
@@ -63,13 +63,17 @@ class Touching:
     allowed
         Whether points of cells (n,) may touch cells (n,).
     h
-        Thickness over R.
+        Thickness over R: that of the penalty and of the search where it varies.
     r0, u
         All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
     own, local
         Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
+    nodes
+        Of both parts.
+    shape
+        The fields that the gap depends on.
     faces
-        How far they are from the mid-surface where the thickness changes with the state; None where it does not.
+        How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
     """
 
     amplitude = None
@@ -87,6 +91,8 @@ class Touching:
         own: tuple[int, int],
         local: tuple[int, int],
         comm: MPI.Comm,
+        nodes: Longs,
+        shape: Shape,
         faces: Faces | None = None,
     ) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
@@ -97,6 +103,8 @@ class Touching:
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
+        self._touched, self._shape = nodes, shape
+        self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
@@ -147,7 +155,8 @@ class Touching:
         """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
         self._pressed()
         number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
-        at = self._facing.places_in(self._points, u, self._facing.placed(u), (1 + AHEAD) * self._h)
+        ahead = self._h + AHEAD * (self._far - self._h) / (REACH - 1)
+        at = self._facing.places_in(self._points, u, self._facing.placed(u), ahead)
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
@@ -157,38 +166,26 @@ class Touching:
     def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
         """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
         grown = self._faces.grown if self._faces else None
+        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
 
-        def twice(before: Twice, q: object) -> Sequence[Derivative]:
-            return [*before(q), *([ByGrowth(self, 2)] if q is grown else [])]
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Of thickness and placement; see `assembly.coupled.KnowsFields`; collective."""
+        field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
+        if field is None:
+            return None
+        now, weights = self._present(), Weights(self._of_copies(whole(direction)), energy, force)
+        if name == "thickness":
+            of_cells = self._comm.allreduce(self._in_modelled(by_factor(now, weights)))
+            return field, of_cells[self._shape.own, :, None]
+        return field, self._shape.shared(self._comm.allreduce(self._on_modelled(by_place(now, weights))))
 
-        return {
-            name: replace(p, slopes=[*p.slopes, ByGrowth(self)], twice=partial(twice, p.twice))
-            for name, p in parameters.items()
-            if p.constant is grown
-        }
-
-    def by_growth(self, order: int = 1) -> float:
-        """The first or second derivative of this rank's energy by the natural stretch."""
-        forces = self._forces()[:, 3]
-        of_forces = float(self._changed()[:, 3] @ self._growth()) if order == 2 else 0.0
-        return of_forces + float(forces @ self._growth(order))
-
-    def add_by_growth(self, b: Array, factor: float) -> None:
-        """Add a factor times the gradient's derivative by the growth; collective."""
-        assert self._faces
-        forces = self._on_nodes(self._changed()) + self._faces.slope_by_growth(self._at, self._forces()[:, 3])
-        self._add(b, factor * forces)
-
-    def _growth(self, order: int = 1) -> Array:
-        assert self._faces
-        return self._faces.by_growth(self._at, order)
-
-    def _changed(self) -> Array:
-        """What the forces (nodes, 4) change by as the faces grow and nothing moves."""
-        rows, columns, values = self._by_parts()
-        along = np.concatenate([np.zeros(self._r0.size), self._growth()])
-        product = np.bincount(rows, values * along[columns], len(along))
-        return np.column_stack([product[: self._r0.size].reshape(-1, 3), product[self._r0.size :]])
+    def _present(self) -> Present:
+        places, joined, pressed = self._pressed()
+        of_all = self._cells, self._r0, self._at, self._faces, self._points
+        found = self._by_parts, self._entries, self._geometry
+        return Present(*of_all, places, joined, pressed, self._forces(), *found)
 
     def _on_nodes(self, forces: Array) -> Array:
         """The forces (nodes, 3) by the displacement, of those by place and thickness."""
@@ -229,7 +226,11 @@ class Touching:
         if not rows:
             return nothing, nothing, np.zeros(0)
         if several.any():
-            i, j, v = self._between(whole, joined, of_group, bend)
+            jointly = several[joined.group]
+            _, n, beta, nodes = self._geometry(whole.of(jointly))
+            slopes = joined.weight[jointly, None, None] * slope_of(n, beta, self._parts)
+            of_joined = self._points.weight[whole.point[joined.first]] / 2 * (bend - of_group / (BLUR * self._h))
+            i, j, v = between(slopes, nodes, joined.group[jointly], of_joined, len(self._r0))
             rows, columns, values = [*rows, i], [*columns, j], [*values, v]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
@@ -243,7 +244,7 @@ class Touching:
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self._facing.found(self._now(), REACH * self._h, self._points)
+        places = self._facing.found(self._now(), self._far, self._points)
         least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
         return least - self._h if np.isfinite(least) else np.nan
 
@@ -251,6 +252,12 @@ class Touching:
         """The largest, over R; 0 where nothing touches; collective."""
         at, *_ = self._pressed()
         return float(self._comm.allreduce(float((self._h - at.distance).max(initial=0.0)), MPI.MAX))
+
+    def depth(self) -> float:
+        """The same over the undeformed thickness there."""
+        at, *_ = self._pressed()
+        deep = (self._h - at.distance) / self._facing.thickness(self._points, at) if len(at.point) else at.distance
+        return float(self._comm.allreduce(float(deep.max(initial=0.0)), MPI.MAX))
 
     def deepest(self) -> tuple[float, Array]:
         """The largest penetration over R, and its place (3,); collective."""
@@ -270,19 +277,24 @@ class Touching:
         """
         at, joined, (_, first, _) = self._pressed()
         points, (start, count) = self._points, self._local
-        weight, p, gap = np.ones(count), np.zeros(count), np.full(count, (REACH - 1) * self._h)
+        weight, p, gap = np.ones(count), np.zeros(count), np.full(count, self._far - self._h)
         np.add.at(weight, points.cell - start, points.weight)
         weight[: len(np.unique(points.cell))] -= 1.0
         pressed = at.point[joined.first]
         np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
-        near = self._facing.found(self._now(), REACH * self._h, points)
+        near = self._facing.found(self._now(), self._far, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
-    def thinner(self, u: Array | None = None) -> float:
-        """The least deformed thickness, over the undeformed one, at the present or a given displacement; collective."""
-        half = self._faces.half(self._now() if u is None else u) if self._faces else self._h / 2
-        return min(1.0, 2 * float(np.min(half)) / self._h)
+    def halves(self) -> tuple[Array, Array]:
+        """Half the undeformed thickness at all nodes, and the present one, over R; collective."""
+        undeformed = self._facing.half
+        return undeformed, self._faces.half(self._now()) if self._faces else undeformed
+
+    def thinnest(self, *displaced: Array) -> float:
+        """The least thickness of both parts over R, undeformed and at displacements of all nodes."""
+        half = self._facing.half, *(self._faces.half(u) for u in displaced if self._faces)
+        return 2 * min(float(each[self._touched].min()) for each in half)
 
     def meet(self, u: Array, v: Array) -> bool:
         """Whether any cells come near each other between two displacements of all nodes; collective."""
@@ -290,8 +302,7 @@ class Touching:
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        far = REACH * self._h
-        least = self._facing.found(self._of_copies(u), far).distance.min(initial=far)
+        least = self._facing.found(self._of_copies(u), self._far).distance.min(initial=self._far)
         return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
 
     def through(self, u: Array, v: Array) -> bool:
@@ -303,7 +314,7 @@ class Touching:
 
     def passes(self, u: Array, v: Array) -> bool:
         """The same of displacements of all that is faced."""
-        moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
+        moved, least = v - u, self.thinnest(u, v)
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
         if not self._facing.near_on_way(u, v):
@@ -380,6 +391,14 @@ class Touching:
         """The displacement of all that is faced, of the nodes that are modelled."""
         return u
 
+    def _in_modelled(self, values: Array) -> Array:
+        """Derivatives by values in modelled cells, of those in all cells."""
+        return values
+
+    def _on_modelled(self, forces: Array) -> Array:
+        """Those (nodes, 3) on modelled nodes, of those on all."""
+        return forces
+
     def _forces(self) -> Array:
         """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
         at, joined, (_, first, _) = self._pressed()
@@ -421,27 +440,5 @@ class Touching:
         """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
         self._about = pressed.on(self._r0)
 
-    def _between(self, at: Places, joined: Joined, first: Array, second: Array) -> Entries:
-        """What the Hessian of joined places has besides those of each."""
-        some = joined.several[joined.group]
-        part, group = at.of(some), joined.group[some]
-        _, n, beta, nodes = self._geometry(part)
-        g = (joined.weight[some, None, None] * slope_of(n, beta, self._parts)).reshape(len(n), -1)
-        dofs = unknowns(nodes, len(self._r0), self._parts)
-        at_row = np.repeat(group, dofs.shape[1])
-        entries = g.ravel(), (at_row, dofs.ravel())
-        G = scipy.sparse.coo_array(entries, (len(first), self._parts * len(self._r0))).tocsr()
-        weight = self._points.weight[at.point[joined.first]] / 2 * (second - first / (BLUR * self._h))
-        hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
-        return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
-
     def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
-        """Distances, normals, and beta (n, functions of both cells) with its nodes."""
-        nodes = np.concatenate([self._cells.nodes[self._points.cell[at.point]], self._cells.nodes[at.cell]], axis=1)
-        r = self._r0 + self._at
-        half = nodes.shape[1] // 2
-        N = self._points.shape[at.point]
-        (shape, y), *_ = jets(self._cells.element, at.X, r[nodes[:, half:]], 0)
-        off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
-        d = np.linalg.norm(off, axis=1)
-        return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
+        return geometry(self._cells, self._points, self._r0 + self._at, at)

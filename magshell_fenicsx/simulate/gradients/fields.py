@@ -9,7 +9,7 @@ with it, and the triangulation stays.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import basix
 import numpy as np
@@ -61,8 +61,13 @@ class Kind:
     project: Projection | None = None
 
 
-def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
+def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> FieldGradient:
     """The derivatives by a field of `FIELDS`; collective.
+
+    Parameters
+    ----------
+    origin
+        The same in the scene that was solved, if it is another one.
 
     Raises
     ------
@@ -70,11 +75,9 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         If no result of the scene depends on it.
     """
     scene = adjoint.scene
-    if name in ("thickness", "deviation") and scene.model.touchings:
-        raise CaseError(f"{name}: no gradient by this field with contact between shells, whose gap it changes")
     other = _with_field(adjoint, name)
     if other is not scene:
-        return by_field(_carried(adjoint, other), name)
+        return by_field(_carried(adjoint, other), name, adjoint)
     model, kind = scene.model, FIELDS[name]
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
@@ -85,6 +88,8 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
 
     def part(number: int, place: Place) -> tuple[fem.Function, list[Array]]:
         """The field, and what a place gives, whose state is set."""
+        if origin:
+            touch_as_in(origin.scene, scene, origin.places[number].state)
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
         w = _contracted(scene, place)
@@ -118,6 +123,15 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     return FieldGradient(f, forces, places, normals)
+
+
+def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
+    """Take contact between shells in another scene on the same mesh as polynomials about a state of the first one."""
+    at = scene.model.system.at(state)
+    of_one: Sequence[Any] = scene.model.touchings
+    of_other: Sequence[Any] = other.model.touchings
+    for touching, same in zip(of_one, of_other, strict=True):
+        same.expand_about(at.of(touching.pressed))
 
 
 def _known(term: KnowsFields, place: Place, w: fem.Function, name: str) -> tuple[fem.Function, Array] | None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, adjoint_of_instability, along, by_load
-from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
+from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field, touch_as_in
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, size_of
@@ -117,11 +117,8 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:
     """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
+    touch_as_in(scene, other, state)
     at = scene.model.system.at(state)
-    of_one: Sequence[Any] = scene.model.touchings
-    of_other: Sequence[Any] = other.model.touchings
-    for touching, same in zip(of_one, of_other, strict=True):
-        same.expand_about(at.of(touching.pressed))
     for name, (pressing, _) in scene.model.contacts.items():
         other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
 

@@ -125,9 +125,9 @@ def test_ball_on_one_of_two() -> None:
     assert normal == pytest.approx(axis, abs=1e-12)
 
 
-def touching(upper: dict[str, Any], z: float, load: dict[str, Any]) -> Scene:
-    """Two shells that may touch."""
-    shells = {"lower": cap(), "upper": placed(upper, z)}
+def touching(upper: dict[str, Any], z: float, load: dict[str, Any], **shell: Any) -> Scene:
+    """Two shells that may touch, the lower one with other keys."""
+    shells = {"lower": cap(**shell), "upper": placed(upper, z)}
     return Scene(Case.from_source({"shells": shells, "contact": [["upper", "lower"]], "loading": load}))
 
 
@@ -139,11 +139,18 @@ def pressed(scene: Scene, down: float) -> State:
     return State(model.system.held(u.ravel()), scene.unloaded().mu)
 
 
-@pytest.mark.parametrize(("hole", "z"), [(None, 2 + 1.0001 * h), (6, np.cos(np.radians(6)) * 2 + 1.01 * h)])
-def test_contact_derivatives(hole: float | None, z: float) -> None:
+@pytest.mark.parametrize(
+    ("hole", "z", "shell"),
+    [
+        (None, 2 + 1.0001 * h, {}),
+        (6, np.cos(np.radians(6)) * 2 + 1.01 * h, {}),
+        (None, 2 + 1.35001 * h, {"thickness_factor": "1.5 - 4*(x**2 + y**2)"}),
+    ],
+)
+def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]) -> None:
     """Residual and tangent by differences, face on face and an edge on a face; waves of m = 0 have half the tangent."""
-    upper = cap() if hole is None else cap(hole=hole)
-    scene = touching(upper, z, PRESSURE)
+    upper = cap(**({"thickness_factor": "1.2 - 6*(1 - z)"} if shell else {})) if hole is None else cap(hole=hole)
+    scene = touching(upper, z, PRESSURE, **shell)
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
     at = system.at(state)
     assert at.of(contact.force) > 0
@@ -164,10 +171,11 @@ def test_contact_derivatives(hole: float | None, z: float) -> None:
     assert wave @ Q @ wave == pytest.approx(v @ K @ v / 2, rel=1e-12)
 
 
-@pytest.mark.parametrize("m", [1, 2])
-def test_waves_of_contact(m: int) -> None:
+@pytest.mark.parametrize(("m", "factor"), [(1, None), (2, None), (2, "1.5 - 4*(x**2 + y**2)")])
+def test_waves_of_contact(m: int, factor: str | None) -> None:
     """The second variation along a wave is that of the distances of its points from the moved surface in space."""
-    scene = touching(cap(radius=1.3), 2.3 + 1.0001 * h, PRESSURE)
+    shell, thick = ({"thickness_factor": factor}, 1.25) if factor else ({}, 1.0)
+    scene = touching(cap(radius=1.3), 2.3 + (thick + 1e-4) * h, PRESSURE, **shell)
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
     at = system.at(state)
     faced, (H, nodes) = at.of(contact._pressed), at.of(lambda: contact._second(m))
@@ -178,7 +186,7 @@ def test_waves_of_contact(m: int) -> None:
     Q = np.einsum("na,nab,nb", waves, H[some], waves) / 2
     nodal = np.column_stack([r + state.u.reshape(-1, 2), U, V, W])
     element, cells = scene.model.V.element.basix_element, scene.model.V.dofmap.list
-    rule, k, size = contact._rule, contact.stiffness.value, contact._h
+    rule, k, size, half = contact._rule, contact.stiffness.value, contact._h, contact._half
 
     def moved(row: Any, theta: Any, e: float) -> Any:
         rho, z, u, v, w = row
@@ -189,17 +197,21 @@ def test_waves_of_contact(m: int) -> None:
     def energy(e: float) -> float:
         total, angles = 0.0, 2 * np.pi * (np.arange(2 * m + 1) + 0.3) / (2 * m + 1)
         for point, cell, X in zip(faced.point[some], faced.cell[some], faced.X[some], strict=True):
-            own, its = rule.shape[point] @ nodal[cells[rule.cell[point]]], nodal[cells[cell]]
+            own = rule.shape[point] @ nodal[cells[rule.cell[point]]]
             for theta in angles:
                 x = moved(own, theta, e)
 
-                def off(y: Any, x: Any = x, its: Any = its, theta: float = theta) -> Any:
-                    row = element.tabulate(0, np.array([[y[0]]]))[0, 0, :, 0] @ its
-                    return x - moved(row, theta + y[1], e)
+                def gap(y: Any, x: Any = x, cell: int = cell, theta: float = theta) -> Any:
+                    shape = element.tabulate(0, np.array([[y[0]]]))[0, 0, :, 0]
+                    row = shape @ nodal[cells[cell]]
+                    return np.linalg.norm(x - moved(row, theta + y[1], e)) - shape @ half[cells[cell]]
 
-                near = scipy.optimize.least_squares(off, [X, 0.0], jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-                d = np.linalg.norm(near.fun)
-                total += rule.weight[point] / 2 * penalty(np.array(size - d), k, SOFT * size)[0] / len(angles)
+                def slope(y: Any, gap: Any = gap) -> Any:
+                    return [gap(y + step) - gap(y - step) for step in 1e-3 * np.eye(2)]
+
+                near = scipy.optimize.root(slope, [X, 0.0], tol=1e-14)
+                deep = rule.shape[point] @ half[cells[rule.cell[point]]] - gap(near.x)
+                total += rule.weight[point] / 2 * penalty(np.array(deep), k, SOFT * size)[0] / len(angles)
         return total
 
     e = 1e-4 * h
@@ -228,16 +240,18 @@ def test_messages() -> None:
 
 
 @pytest.mark.slow
-def test_two_caps_are_one_on_a_plane() -> None:
-    """Pressed pole to pole each is as one on a rigid plane: F at one thickness to 1e-3."""
+@pytest.mark.parametrize(("factor", "top"), [("1", 1.0), ("1.3 - 4*(1 - z)", 1.3)])
+def test_two_caps_are_one_on_a_plane(factor: str, top: float) -> None:
+    """Pressed pole to pole each is as one on a rigid plane: F at one thickness to 1e-3; also of tapered ones."""
 
     def moved(**moves: float) -> dict[str, Any]:
         moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
         return {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moving}
 
-    plane = {"kind": "plane", "position": [0, 0, 1 + h / 2], "direction": [0, 0, -1]}
-    _, one = end(cap(polar=40) | {"bodies": {"plane": plane}, "loading": moved(rim=1)})
-    shells = {"lower": cap(polar=40), "upper": placed(cap(polar=40), 2 + h)}
+    plane = {"kind": "plane", "position": [0, 0, 1 + top * h / 2], "direction": [0, 0, -1]}
+    shell = cap(polar=40, thickness_factor=factor)
+    _, one = end(shell | {"bodies": {"plane": plane}, "loading": moved(rim=1)})
+    shells = {"lower": shell, "upper": placed(shell, 2 + top * h)}
     load = moved(lower_rim=1, upper_rim=-1)
     two, seen = end({"shells": shells, "contact": [["upper", "lower"]], "loading": load})
     assert two.model.axisymmetric
