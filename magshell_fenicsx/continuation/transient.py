@@ -37,6 +37,7 @@ FLOOR = 1e-3  # of the length: energies below that of such a displacement count 
 STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
 ROUNDED = 10.0  # steps up to this many times the rounding error are
 MOST = 20  # iterations
+FAR = 3.0  # lengths: a step that is longer, and than the first one, does not come back
 PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
@@ -230,7 +231,7 @@ class Integrator:
             u = u + dt**2 / 2 * now.a
         y = self.device.unknowns(now.mu) if self.device else np.empty(0)
         pull = self._pull(now, dt)
-        last, fresh, grown = np.inf, False, 0
+        last, first, fresh, grown = np.inf, np.inf, False, 0
         if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
@@ -255,11 +256,11 @@ class Integrator:
                 return self._accepted(now, u, y, dt)
             if size > SLOW * last:
                 grown = grown + 1 if fresh and size > last else 0
-                if grown > (PATIENCE if self.averaged else 0):
+                if grown > (PATIENCE if self.averaged else 0) or (fresh and size > max(FAR, first)):
                     break
                 self._factor(now, u, y, dt)
                 fresh, chord = True, self._chord()
-            last = size
+            last, first = size, size if first == np.inf else first
         self.factored = None
         return "Newton's method does not converge"
 

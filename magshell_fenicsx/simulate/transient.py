@@ -74,6 +74,19 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     return np.asarray(model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]))
 
 
+def thrown(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
+    """The clock of the state before a step, with the energy of its initial velocity; empty without one."""
+    v = by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
+    if load.push and load.push.velocity:
+        v = pushed(scene, load.push, state, v)[1]
+    if not max_abs(scene.comm, v):
+        return {}
+    x, Mx = (M := mass(scene.model)).createVecs()
+    x.setArray(v)
+    M.mult(x, Mx)
+    return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}
+
+
 def own_time(value: Time) -> float:
     """A time in the case's own unit."""
     return float(in_units("second")(value))

@@ -108,3 +108,12 @@ def test_a_plane_with_a_position_beside_several_shells() -> None:
     floor = {"kind": "plane", "position": ["0 mm", "0 mm", "-0.7 mm"], "direction": [0, 0, 1]}
     (contact,) = Case.from_source(DISCS | {"loading": [THROWN], "bodies": {"floor": floor}}).problem().loads.contacts
     assert contact.front == pytest.approx([0, 0, -0.7 / 50], abs=1e-12)
+
+
+@pytest.mark.parametrize("symmetry", MESHES)
+def test_the_start_row_has_the_energy_of_the_initial_velocity(symmetry: str) -> None:
+    """m v^2/2 of two discs that move apart as (1 - r^2)^2, whose square has the mean 1/5; over E h R^2."""
+    found = found_of(DISCS | {"loading": [{**THROWN, "points": 1}], "symmetry": symmetry, "mesh": MESHES[symmetry]})
+    v = 0.05 / np.sqrt(1e6 / 1000)  # over the speed of waves
+    assert found[0]["kinetic"] == pytest.approx(2 * np.pi * v**2 / 2 / 5, rel=1e-3)
+    assert found[0]["imbalance"] == 0

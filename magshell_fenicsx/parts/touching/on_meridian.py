@@ -17,15 +17,16 @@ from zlib import crc32
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
-from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
+from magshell_fenicsx.parts.touching.curves import Close, Faced, Rule, beside, nowhere
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, FOLLOWING, ROUNDS
+from magshell_fenicsx.parts.touching.nearest import EXACT, FLAT, FOLLOWING, ROUNDS
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
@@ -71,6 +72,7 @@ class MeridianTouching:
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
         k = self._element.degree
         self._start = np.linspace(0.0, 1.0, START * k + 1, dtype=np.float64)
+        self._close = Close(self._rule, self._nodes, sides, self._element)
 
     # as a term
 
@@ -124,8 +126,8 @@ class MeridianTouching:
         return pairs_of(np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1))
 
     def _touching_cells(self) -> Longs:
-        at = self._pressed()
-        return np.unique(np.column_stack([self._rule.cell[at.point], at.cell]), axis=0)
+        both = [np.column_stack([self._rule.cell[at.point], at.cell]) for at in of_each(self, self._pressed)]
+        return np.asarray(np.unique(np.concatenate(both), axis=0))
 
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
@@ -143,7 +145,11 @@ class MeridianTouching:
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach."""
-        least = self._found(self._now(), REACH * self._h).distance.min(initial=np.inf)
+        u = self._now()
+        x, (one, other) = self._x_of(r := self._r0 + u), (r[self._nodes[side]].reshape(-1, 2) for side in self._sides)
+        first = self._rule.first
+        to_nodes = min(cdist(x[first], other).min(), cdist(x[~first], one).min())  # no place is farther
+        least = self._found(u, min(REACH * self._h, to_nodes * (1 + SAME))).distance.min(initial=np.inf)
         return float(least - self._h) if np.isfinite(least) else np.nan
 
     def penetration(self) -> float:
@@ -278,21 +284,9 @@ class MeridianTouching:
 
     def _found(self, u: Array, reach: float) -> Faced:
         """The places that points face within a distance at a displacement: one on each side of a point at most."""
-        r, rule = self._r0 + u, self._rule
+        r = self._r0 + u
         x, nodal = self._x_of(r), r[self._nodes]
-        centres = nodal.mean(axis=1)
-        radii = BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-        parts = list[tuple[Longs, Longs]]()
-        for mine, others in zip((rule.first, ~rule.first), self._sides[::-1], strict=True):
-            near, cells = np.unique(rule.cell[mine]), np.flatnonzero(others)
-            far = np.linalg.norm(centres[near][:, None] - centres[cells], axis=2) - radii[cells] - reach
-            within = np.zeros(len(nodal), dtype=bool)
-            within[near] = (far < radii[near][:, None]).any(axis=1)
-            points, cells = np.flatnonzero(mine & within[rule.cell]), cells[(far < radii[near][:, None]).any(axis=0)]
-            away = np.linalg.norm(x[points][:, None] - centres[cells], axis=2)
-            i, j = np.nonzero(away < radii[cells] + reach)
-            parts.append((points[i], cells[j]))
-        point, cell = (np.concatenate(each) for each in zip(*parts, strict=True))
+        point, cell = self._close(x, nodal, reach)
         if not len(point):
             return nowhere()
         at = self._projected(x, nodal, point, cell)
