@@ -141,7 +141,7 @@ class Integrator:
         mu = self.loads(t, False)
         work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
         if before:
-            mu |= {name: before.mu[name] for name in self._free}
+            mu |= {name: before.mu[name] for name in self._free} | self._kept(before)
         inverse = self._inverse_mass()
         if self.ground:  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
             work -= self._kinetic(v, t, True)
@@ -214,6 +214,9 @@ class Integrator:
 
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
+        if self.averaged:
+            v = now.v + self.ground.velocity(now.t, False) if self.ground else now.v
+            now = replace(now, mu=now.mu | self.averaged.harder(State(now.u, now.mu), v))
         try:
             return self._step(now, dt)
         except np.linalg.LinAlgError:
@@ -292,7 +295,11 @@ class Integrator:
         if self.ground:
             last = self.loads(now.t + dt, True)
             ends |= {name: last[name] for name in self.ground.names & set(mu)}
-        return mu | {name: now.mu[name] + part * (end - now.mu[name]) for name, end in ends.items()}
+        return mu | self._kept(now) | {n: now.mu[n] + part * (end - now.mu[n]) for n, end in ends.items()}
+
+    def _kept(self, now: Motion) -> dict[str, float]:
+        """The stiffnesses of contacts, which a motion raises and keeps."""
+        return {name: now.mu[name] for name in self.averaged.settings & set(now.mu)} if self.averaged else {}
 
     def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
         rule = self.rule
@@ -402,7 +409,7 @@ class Integrator:
 
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
         """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
-        mu, still = now.mu, self.system.coordinates - self._driven
+        mu, still = now.mu, (self.system.coordinates - self._driven) | set(self._kept(now))
         potentials = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
         if self.ground:
             a = now.a + self.ground.acceleration(now.t, before)

@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
-NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
+NO_KEYS = ("a word", "a gas", "a pair", "a pair with keys")  # tags of a union that has no sections to choose from
 NO_CONTAINER = ("list_type", "dict_type")
 LIKE_A_NAME = "[A-Za-z]"  # what patterns of names contain, others are of text with a unit
 

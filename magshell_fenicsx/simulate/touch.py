@@ -29,6 +29,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
@@ -85,9 +86,21 @@ def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
             raised[contact.setting] = STIFFER * k
     for pair, deep in between(scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
-        if deep > NEARLY * pair.bound * h and k < AT_A_CORNER * pair.stiffness:
+        if deep > NEARLY * pair.bound * h and not pair.given and k < AT_A_CORNER * pair.stiffness:
             raised[pair.setting] = STIFFER * k
     return raised
+
+
+def stiff_for(pair: Pair, speed: float, h: float) -> float:
+    """The stiffness of a pair that meets flat with this speed, over that of waves, and goes `HIT` deep; h is over R.
+
+    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with half the mean of
+    both masses per area.
+    """
+    wanted, k = pair.thickness / 2 * (speed / (HIT * h)) ** 2, pair.stiffness
+    while k < wanted:
+        k *= STIFFER
+    return k
 
 
 def recut(stage: Stage, low: Point, high: Point) -> State | None:
@@ -231,8 +244,9 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
         bound = pair.bound * (IMPACT if moving else 1.0)
         if deep > bound * h:
             what = f"the penetration between {pair.words} is {deep / h:.3g} h, more than {bound:g} h"
-            if moving:
-                raise Stopped(f"{what}: they hit each other too fast for the penalty")
+            k = state.mu.get(pair.setting, pair.stiffness)
+            if moving or pair.given:
+                raise Stopped(f"{what}; contact: stiffness: is {k:.4g}: give four times as much")
             raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")
 
 

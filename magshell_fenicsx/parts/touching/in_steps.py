@@ -112,6 +112,9 @@ class InSteps(Protocol):
     def where(self) -> Array:
         """The displacement of all that is faced; collective."""
 
+    def penetration(self) -> float:
+        """The largest, over R; collective."""
+
     def passes(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface between two of these; collective."""
 

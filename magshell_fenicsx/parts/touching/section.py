@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
+from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
@@ -20,10 +21,30 @@ Value = TypeVar("Value")
 WHOLE = "shell"
 KEEP_THICKNESS = ("koiter", "laminate")  # laws
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
-Pairs = Annotated[
-    list[Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]],
-    Field(max_length=20),
+Both = Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]
+
+
+class PairSection(Section):
+    """A pair of `contact` with more than its names."""
+
+    between: Both
+    """What may touch"""
+    stiffness: float | None = Field(default=None, gt=0, le=1e12)
+    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²), and four times as much each time
+    that the penetration would exceed 1e-3 h, in a motion 0.1 h for a moment; a given one stays, and the run stops where
+    the penetration is more [E h/R²]"""
+
+
+GivenPair = Annotated[
+    Annotated[Both, Tag("a pair")] | Annotated[PairSection, Tag("a pair with keys")],
+    Discriminator(lambda data: "a pair with keys" if isinstance(data, dict | PairSection) else "a pair"),
 ]
+Pairs = Annotated[list[GivenPair], Field(max_length=20)]
+
+
+def names_in(pair: GivenPair) -> list[str]:
+    """Of a pair as a case has it."""
+    return pair.between if isinstance(pair, PairSection) else pair
 
 
 @dataclass(frozen=True)
@@ -42,6 +63,8 @@ class Pair:
         Largest penetration that is allowed, over h.
     thickness
         The mean of both thicknesses over h.
+    given
+        Whether the case gives its stiffness, which then stays.
     """
 
     names: tuple[str, str]
@@ -49,6 +72,7 @@ class Pair:
     stiffness: float
     bound: float = 1e-3
     thickness: float = 1.0
+    given: bool = False
 
     @property
     def setting(self) -> str:
@@ -66,7 +90,7 @@ class Pair:
         return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
 
 
-class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
+class ShellContact(KeyAbility[Sequence[GivenPair]]):
     """All pairs of a case that may touch."""
 
     key = "contact"
@@ -77,9 +101,10 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """All planes: a half sees its image. The meridian where shells of constant thickness touch each other."""
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        names, laws = {name for pair in self.given for name in pair}, several.laws if several else {}
+        pairs = [names_in(pair) for pair in self.given]
+        names, laws = {name for pair in pairs for name in pair}, several.laws if several else {}
         why = None
-        if not names <= {*laws} or any(one == other for one, other in self.given):
+        if not names <= {*laws} or any(one == other for one, other in pairs):
             why = "contact: a shell that may touch itself is modelled with its circumference"
         elif any(laws[name] not in KEEP_THICKNESS for name in names):
             why = "contact: shells that get thinner as they stretch are modelled with their circumference"
@@ -92,7 +117,7 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
 
 
 def pairs(
-    given: Sequence[Sequence[str]],
+    given: Sequence[GivenPair],
     nu: float,
     thickness: Mapping[str, float | None],
     moduli: Mapping[str, float] | None = None,
@@ -111,17 +136,14 @@ def pairs(
     CaseError
         If the faces of a pair are not one distance from their mid-surfaces.
     """
-    k = STIFF / (12 * (1 - nu**2))
-    several = len(given) > 1
-    return tuple(
-        Pair(
-            (one, other),
-            f"_{one}_{other}" if several else "",
-            k * min([*_of_shells(one, moduli or {}), *_of_shells(other, moduli or {})], default=1.0),
-            thickness=_mean(i, (one, other), thickness),
-        )
-        for i, (one, other) in enumerate(given)
-    )
+    k, made = STIFF / (12 * (1 - nu**2)), list[Pair]()
+    for i, pair in enumerate(given):
+        one, other = names_in(pair)
+        softer = min([*_of_shells(one, moduli or {}), *_of_shells(other, moduli or {})], default=1.0)
+        own = pair.stiffness if isinstance(pair, PairSection) else None
+        suffix, thick = f"_{one}_{other}" if len(given) > 1 else "", _mean(i, (one, other), thickness)
+        made.append(Pair((one, other), suffix, own or k * softer, thickness=thick, given=own is not None))
+    return tuple(made)
 
 
 def _of_shells(name: str, values: Mapping[str, Value]) -> list[Value]:
@@ -143,7 +165,7 @@ def _mean(number: int, pair: Sequence[str], thickness: Mapping[str, float | None
     return sum(found) / len(found) if found else 1.0
 
 
-def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None:
+def refuse_unfit_pairs(given: Sequence[GivenPair], context: Context) -> None:
     """See that a model can have these contacts.
 
     Raises
@@ -152,7 +174,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
         With the key and what is allowed.
     """
     seen, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
-    for i, pair in enumerate(given):
+    for i, pair in enumerate(map(names_in, given)):
         if frozenset(pair) in seen:
             raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
         seen.add(frozenset(pair))
@@ -185,6 +207,7 @@ def account(context: Context, loads: "Loads") -> Account:
     return Account(
         [
             f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"
+            + (", as given" if pair.given else "")
             for pair in loads.pairs
         ]
     )
