@@ -32,6 +32,10 @@ NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells 
 HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
+WAYS, HALVINGS = (
+    65,
+    30,
+)  # places of supports on the way at which they are looked at, and halvings of the part they meet in
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
 
@@ -248,6 +252,40 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
             if moving or pair.given:
                 raise Stopped(f"{what}; contact: stiffness: is {k:.4g}: give four times as much")
             raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")
+
+
+def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:
+    """How far supports can move before what they hold meets, and why no farther: the end, and no words, if they can.
+
+    What two supports hold does not give way. Nodes stand for it, so that edges which cross are not seen.
+    """
+    model, comm, dim = scene.model, scene.comm, 2 if scene.model.axisymmetric else 3
+    if name not in scene.motions or not model.touchings:
+        return end, ""
+    fixed = np.zeros(model.system.size, dtype=bool)
+    for bc in model.system.clamped:
+        dofs = bc.dof_indices()[0]
+        fixed[dofs[dofs < len(fixed)]] = True
+    held = np.flatnonzero(np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1))
+    begin = state.mu[name]
+
+    def met(part: float) -> str:
+        at = state.with_(state.u, name, begin + part * (end - begin))
+        u = np.concatenate(comm.allgather(model.system.with_ghosts(at.u, at.mu)[: model.system.size])).reshape(-1, dim)
+        for each in model.touchings:
+            if each.held_gap(held, u) < (1 - each.pair.bound) * each.pair.thickness * scene.problem.material.h:
+                return each.pair.words
+        return ""
+
+    parts = np.linspace(0.0, 1.0, WAYS)
+    first = next((i for i in range(1, WAYS) if met(parts[i])), None)
+    if first is None or met(0.0):
+        return end, ""
+    low, high = parts[first - 1 : first + 1]
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if met(middle) else (middle, high)
+    return float(begin + low * (end - begin)), met(high)
 
 
 def pressing(scene: Scene, state: State) -> list[Contact]:

@@ -156,6 +156,12 @@ class MeridianTouching:
         """The largest, over R; 0 where nothing touches."""
         return float((self._h - self._pressed().distance).max(initial=0.0))
 
+    def held_gap(self, held: Longs, u: Array) -> float:
+        """See `Facing.held_gap`."""
+        one, other = (np.intersect1d(held, self._nodes[side]) for side in self._sides)
+        r = self._r0 + u
+        return float(cdist(r[one], r[other]).min(initial=np.inf))
+
     def refuse_overlap(self, h: float) -> None:
         """See that the shells do not overlap undeformed; `h` is that of the first one.
 
