@@ -124,4 +124,6 @@ def test_clamps_that_meet_end_the_path_at_once() -> None:
     found = []
     with pytest.raises(Stopped, match=r"supports hold lower and upper in each other from motion = 0\.500"):
         found.extend(follow(Scene(Case.from_source(case))))
-    assert [record.point.state.mu["motion"] for record in found if record.label == "target"] == pytest.approx([0.2, 0.4])
+    assert [record.point.state.mu["motion"] for record in found if record.label == "target"] == pytest.approx(
+        [0.2, 0.4]
+    )

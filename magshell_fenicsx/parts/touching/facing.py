@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.nearest import (
@@ -169,7 +169,7 @@ class Facing:
         cell_of = np.zeros(len(self._r0), dtype=np.int64)
         cell_of[self._cells.nodes.ravel()] = np.repeat(np.arange(len(self._cells.nodes)), self._cells.nodes.shape[1])
         cells, before = cell_of[held], self._r0[held]
-        i, j = np.nonzero(cdist(before, before) > (1 - SAME) * self._h)
+        i, j = np.nonzero(scipy.spatial.distance.cdist(before, before) > (1 - SAME) * self._h)
         near = np.linalg.norm(before[i] + u[held[i]] - before[j] - u[held[j]], axis=1)
         counts = near < self._h
         i, j, near = i[counts], j[counts], near[counts]

@@ -15,9 +15,9 @@ from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
+import scipy
 from dolfinx import fem
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
@@ -148,7 +148,8 @@ class MeridianTouching:
         u = self._now()
         x, (one, other) = self._x_of(r := self._r0 + u), (r[self._nodes[side]].reshape(-1, 2) for side in self._sides)
         first = self._rule.first
-        to_nodes = min(cdist(x[first], other).min(), cdist(x[~first], one).min())  # no place is farther
+        apart = scipy.spatial.distance.cdist
+        to_nodes = min(apart(x[first], other).min(), apart(x[~first], one).min())  # no place is farther
         least = self._found(u, min(REACH * self._h, to_nodes * (1 + SAME))).distance.min(initial=np.inf)
         return float(least - self._h) if np.isfinite(least) else np.nan
 
@@ -160,7 +161,7 @@ class MeridianTouching:
         """See `Facing.held_gap`."""
         one, other = (np.intersect1d(held, self._nodes[side]) for side in self._sides)
         r = self._r0 + u
-        return float(cdist(r[one], r[other]).min(initial=np.inf))
+        return float(scipy.spatial.distance.cdist(r[one], r[other]).min(initial=np.inf))
 
     def refuse_overlap(self, h: float) -> None:
         """See that the shells do not overlap undeformed; `h` is that of the first one.
