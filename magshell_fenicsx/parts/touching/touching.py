@@ -96,7 +96,7 @@ class Touching:
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
-        self.facing = Facing(cells, rule, allowed, h, r0, faces, comm)
+        self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
@@ -147,7 +147,7 @@ class Touching:
         """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
         self._pressed()
         number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
-        at = self.facing.places_in(self._points, u, self.facing.placed(u), (1 + AHEAD) * self._h)
+        at = self._facing.places_in(self._points, u, self._facing.placed(u), (1 + AHEAD) * self._h)
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
@@ -216,7 +216,7 @@ class Touching:
             after = starts[np.searchsorted(starts, some[-1]) + 1 :]
             part = slice(some[0], after[0] if len(after) else len(keys))
             some_at = at.of(part)
-            geometry, placed = self._geometry(some_at), self.facing.placed(self._at)
+            geometry, placed = self._geometry(some_at), self._facing.placed(self._at)
             H = hessians(self._cells, some_at, geometry, placed, (weight[part], first[part], second[part]))
             nodes = geometry[3]
             sums = np.add.reduceat(H, some - some[0], axis=0)
@@ -243,7 +243,7 @@ class Touching:
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self.facing.found(self._now(), REACH * self._h, self._points)
+        places = self._facing.found(self._now(), REACH * self._h, self._points)
         least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
         return least - self._h if np.isfinite(least) else np.nan
 
@@ -258,7 +258,7 @@ class Touching:
         mine = (0.0, np.zeros(3))
         if len(at.point):
             worst = int(at.distance.argmin())
-            x = self.facing.x_of(self._points, self._r0 + self._now(), at.point[[worst]])[0]
+            x = self._facing.x_of(self._points, self._r0 + self._now(), at.point[[worst]])[0]
             mine = (float(self._h - at.distance[worst]), x)
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
@@ -275,7 +275,7 @@ class Touching:
         weight[: len(np.unique(points.cell))] -= 1.0
         pressed = at.point[joined.first]
         np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
-        near = self.facing.found(self._now(), REACH * self._h, points)
+        near = self._facing.found(self._now(), REACH * self._h, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
 
@@ -286,16 +286,16 @@ class Touching:
 
     def meet(self, u: Array, v: Array) -> bool:
         """Whether any cells come near each other between two displacements of all nodes; collective."""
-        return self.facing.near_on_way(self._of_copies(u), self._of_copies(v))
+        return self._facing.near_on_way(self._of_copies(u), self._of_copies(v))
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        least = self.facing.found(self._of_copies(u), far := REACH * self._h).distance.min(initial=far)
+        least = self._facing.found(self._of_copies(u), far := REACH * self._h).distance.min(initial=far)
         return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
-        return self.facing.held_gap(held, self._of_copies(u))
+        return self._facing.held_gap(held, self._of_copies(u))
 
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
@@ -309,10 +309,10 @@ class Touching:
         moved, least = v - u, min(self.thinner(u), self.thinner(v)) * self._h
         moved = moved - moved.mean(axis=0)
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
-        if not self.facing.near_on_way(u, v):
+        if not self._facing.near_on_way(u, v):
             return False
         for k in range(1, looks):
-            near = self.facing.found(u + k / looks * (v - u), NEARER * least, faces=False)
+            near = self._facing.found(u + k / looks * (v - u), NEARER * least, faces=False)
             if self._comm.allreduce(len(near.point)):
                 return True
         return False
@@ -346,14 +346,14 @@ class Touching:
         u = self._now()
         at, *_ = self._pressed()
         now = self._segments.normals(self._r0 + u)
-        turned = self._force(self._points, at.of(self.facing.left_to_edges(self._points, at, now)))
-        turned += self._force(self._points, self._left.of(~self.facing.left_to_edges(self._points, self._left, now)))
+        turned = self._force(self._points, at.of(self._facing.left_to_edges(self._points, at, now)))
+        turned += self._force(self._points, self._left.of(~self._facing.left_to_edges(self._points, self._left, now)))
         astray = self._astray(self._points, at, turned)
         if astray <= ASTRAY:
             return None
         points, normals = self._cuts.at(u)
-        places = self.facing.found(u, self._h, points)
-        counted = places.of(~self.facing.left_to_edges(points, places, normals))
+        places = self._facing.found(u, self._h, points)
+        counted = places.of(~self._facing.left_to_edges(points, places, normals))
         return self._cuts.numbered(u) if self._astray(points, counted) < astray / 2 else None
 
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
@@ -371,8 +371,8 @@ class Touching:
     def _near(self, u: Array) -> Places:
         """The places in all cells that may press on cells of this rank at a displacement."""
         far = self._h + self._segments.within
-        near = self.facing.places_in(self._rule, u, self.facing.placed(u), float(far.max()))
-        return self.facing.of_far_cells(self._rule, near.of(near.distance < far[self._rule.cell[near.point]]))
+        near = self._facing.places_in(self._rule, u, self._facing.placed(u), float(far.max()))
+        return self._facing.of_far_cells(self._rule, near.of(near.distance < far[self._rule.cell[near.point]]))
 
     # geometry
 
@@ -398,7 +398,7 @@ class Touching:
         with its derivatives by the penetration."""
         if self._about:
             self._at, self._points = np.array(self._now()), self._about.points
-            return self._about.at(self.facing, self._at, self.stiffness.value, self._h)
+            return self._about.at(self._facing, self._at, self.stiffness.value, self._h)
         u, grown = self._now(), self._faces.value if self._faces else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
@@ -411,8 +411,8 @@ class Touching:
 
     def _faced(self, points: Points, normals: Array, u: Array) -> tuple[Places, Places, Joined]:
         """The places that count, those left to edges, and how the former are joined."""
-        places = self.facing.found(u, (1 + SAME) * self._h, points)
-        left = self.facing.left_to_edges(points, places, normals)
+        places = self._facing.found(u, (1 + SAME) * self._h, points)
+        left = self._facing.left_to_edges(points, places, normals)
         return places.of(~left), places.of(left), Joined.of(places.of(~left), BLUR * self._h)
 
     def pressed(self) -> Expanded:
