@@ -86,7 +86,7 @@ class Case(WithParts):
     contact: Pairs = Field(default=[])
     """Pairs that may touch, half a thickness from their mid-surfaces (of rubber half the deformed one), without
     friction: [[shell, shell]] is the shell with itself; in place of `shell` the name of one of several shells, or of a
-    patch of a mesh file"""
+    patch of a mesh file; with keys {between: [shell, shell], stiffness: 1e5}"""
     joints: Joints = Field(default=[])
     """Edges of several shells that meet, and how they are joined"""
     loading: Loading | None = None

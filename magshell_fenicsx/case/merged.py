@@ -241,7 +241,9 @@ def _magnetised(magnetic: Any, several: Several) -> Any:
 
 def _pairs(given: Any) -> list[list[str]]:
     """The pairs of names among what `contact` has; what else it has is refused later."""
-    pairs = [pair for pair in given if isinstance(pair, list | tuple)] if isinstance(given, list | tuple) else []
+    parts = given if isinstance(given, list | tuple) else []
+    entries = [part.get("between") if isinstance(part, dict) else part for part in parts]
+    pairs = [pair for pair in entries if isinstance(pair, list | tuple)]
     return [[*pair] for pair in pairs if len(pair) == 2 and all(isinstance(name, str) for name in pair)]
 
 

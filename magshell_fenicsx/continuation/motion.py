@@ -98,9 +98,15 @@ class Averaged(Protocol):
     ----------
     names
         Amplitudes that are positions of what touches.
+    settings
+        Names of the stiffnesses that `harder` may give.
     """
 
     names: frozenset[str]
+    settings: frozenset[str]
+
+    def harder(self, begin: State, v: Vector) -> dict[str, float]:
+        """Settings of what must become stiffer before a step, since it may meet too fast, and stores nothing yet."""
 
     def along(self, begin: State, end: State, part: float) -> None:
         """Let the system's forces at this part of a step be its mean ones, until `present`."""

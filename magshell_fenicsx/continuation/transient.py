@@ -37,6 +37,7 @@ FLOOR = 1e-3  # of the length: energies below that of such a displacement count 
 STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
 ROUNDED = 10.0  # steps up to this many times the rounding error are
 MOST = 20  # iterations
+FAR = 3.0  # lengths: a step that is longer, and than the first one, does not come back
 PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
@@ -140,7 +141,7 @@ class Integrator:
         mu = self.loads(t, False)
         work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
         if before:
-            mu |= {name: before.mu[name] for name in self._free}
+            mu |= {name: before.mu[name] for name in self._free} | self._kept(before)
         inverse = self._inverse_mass()
         if self.ground:  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
             work -= self._kinetic(v, t, True)
@@ -213,6 +214,9 @@ class Integrator:
 
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
+        if self.averaged:
+            v = now.v + self.ground.velocity(now.t, False) if self.ground else now.v
+            now = replace(now, mu=now.mu | self.averaged.harder(State(now.u, now.mu), v))
         try:
             return self._step(now, dt)
         except np.linalg.LinAlgError:
@@ -230,7 +234,7 @@ class Integrator:
             u = u + dt**2 / 2 * now.a
         y = self.device.unknowns(now.mu) if self.device else np.empty(0)
         pull = self._pull(now, dt)
-        last, fresh, grown = np.inf, False, 0
+        last, first, fresh, grown = np.inf, np.inf, False, 0
         if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
@@ -255,11 +259,11 @@ class Integrator:
                 return self._accepted(now, u, y, dt)
             if size > SLOW * last:
                 grown = grown + 1 if fresh and size > last else 0
-                if grown > (PATIENCE if self.averaged else 0):
+                if grown > (PATIENCE if self.averaged else 0) or (fresh and size > max(FAR, first)):
                     break
                 self._factor(now, u, y, dt)
                 fresh, chord = True, self._chord()
-            last = size
+            last, first = size, size if first == np.inf else first
         self.factored = None
         return "Newton's method does not converge"
 
@@ -291,7 +295,11 @@ class Integrator:
         if self.ground:
             last = self.loads(now.t + dt, True)
             ends |= {name: last[name] for name in self.ground.names & set(mu)}
-        return mu | {name: now.mu[name] + part * (end - now.mu[name]) for name, end in ends.items()}
+        return mu | self._kept(now) | {n: now.mu[n] + part * (end - now.mu[n]) for n, end in ends.items()}
+
+    def _kept(self, now: Motion) -> dict[str, float]:
+        """The stiffnesses of contacts, which a motion raises and keeps."""
+        return {name: now.mu[name] for name in self.averaged.settings & set(now.mu)} if self.averaged else {}
 
     def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
         rule = self.rule
@@ -401,7 +409,7 @@ class Integrator:
 
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
         """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
-        mu, still = now.mu, self.system.coordinates - self._driven
+        mu, still = now.mu, (self.system.coordinates - self._driven) | set(self._kept(now))
         potentials = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
         if self.ground:
             a = now.a + self.ground.acceleration(now.t, before)

@@ -17,8 +17,9 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
-NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
+NO_KEYS = ("a word", "a gas", "a pair", "a pair with keys")  # tags of a union that has no sections to choose from
 NO_CONTAINER = ("list_type", "dict_type")
+LIKE_A_NAME = "[A-Za-z]"  # what patterns of names contain, others are of text with a unit
 
 
 def meaning(section: type[BaseModel], key: str) -> str:
@@ -90,6 +91,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     said = re.sub(r"^\w+ should have (at \w+ \d+) items? after validation, not", r"must have \1 items, not", said)
+    if kind == "string_pattern_mismatch":
+        name = LIKE_A_NAME in error["ctx"]["pattern"]
+        said = "must be a letter, then letters, digits and _" if name else "must be a number with a unit"
     if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
         keys = about[1].split(".")
         location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]

@@ -54,7 +54,12 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         raise
     pivots = 0 if scene.loose else scene.newton.factor_at(state).negative_pivots
     start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
-    yield Record("start", "", start, scene=scene, shown=scene.displacement)
+    clock = dict[str, float]()
+    if steps and (first_motion := steps[0].load.motion) and not own:
+        from magshell_fenicsx.simulate.transient import thrown
+
+        clock = thrown(scene, first_motion, state)
+    yield Record("start", "", start, clock=clock, scene=scene, shown=scene.displacement)
     if pivots:
         raise Stopped(
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"

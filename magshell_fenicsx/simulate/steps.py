@@ -15,7 +15,7 @@ from magshell_fenicsx.simulate.handover import Departure, departed, leaving
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
-from magshell_fenicsx.simulate.touch import touched
+from magshell_fenicsx.simulate.touch import blocked, touched
 from magshell_fenicsx.simulate.walked import Records, Walked, followed, off_path
 
 LOCATED = ("fold", "bifurcation")
@@ -42,6 +42,16 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         raise Stopped(course.impossible)
     if step.name in load.hold:
         return (yield from _at_held_conjugate(scene, step, state, drive))
+    meeting = ""
+    if drive.end is not None and drive.quantity == "load":
+        most, meeting = blocked(scene, state, step.name, drive.end)
+        if meeting:
+            meeting = f"supports hold {meeting} in each other from {step.name} = {most:.4g} on, where their faces meet"
+            sign = 1.0 if drive.end > state.mu[step.name] else -1.0
+            left = [target for target in drive.targets if sign * target <= sign * most]
+            if not left:
+                raise Stopped(meeting)
+            drive = replace(drive, targets=left, end=left[-1])
     stage = staged(scene, state, held_by(scene, step, state), course.curves and (step.name, *course.curves))
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
@@ -63,8 +73,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
             wrong = course.forbidden(record.point.state.mu, record.mode or record.label)
         if wrong and course.at_once:
             raise Stopped(wrong)
-    if wrong:
-        raise Stopped(wrong)
+    if wrong or meeting:
+        raise Stopped(wrong or meeting)
     if load.branch_points and first and excluded(first):
         yield from leaving(stage, first, off_path(goal, load.branch_points), abs(drive.scale), 1)
     return walked.end

@@ -29,8 +29,10 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
+WAYS, HALVINGS = 65, 30  # places on the way of supports that are looked at, and halvings of the part they meet in
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
 
@@ -85,9 +87,21 @@ def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
             raised[contact.setting] = STIFFER * k
     for pair, deep in between(scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
-        if deep > NEARLY * pair.bound and k < AT_A_CORNER * pair.stiffness:
+        if deep > NEARLY * pair.bound and not pair.given and k < AT_A_CORNER * pair.stiffness:
             raised[pair.setting] = STIFFER * k
     return raised
+
+
+def stiff_for(pair: Pair, speed: float, h: float) -> float:
+    """The stiffness of a pair that meets flat with this speed, over that of waves, and goes `HIT` deep; h is over R.
+
+    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with half the mass per
+    area of the first shell.
+    """
+    wanted, k = (speed / (HIT * h)) ** 2 / 2, pair.stiffness
+    while k < wanted:
+        k *= STIFFER
+    return k
 
 
 def recut(stage: Stage, low: Point, high: Point) -> State | None:
@@ -233,9 +247,44 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
         bound = pair.bound * (IMPACT if moving else 1.0)
         if deep > bound:
             what = f"the penetration between {pair.words} is {deep:.3g} h, more than {bound:g} h"
-            if moving:
-                raise Stopped(f"{what}: they hit each other too fast for the penalty")
+            k = state.mu.get(pair.setting, pair.stiffness)
+            if moving or pair.given:
+                raise Stopped(f"{what}; contact: stiffness: is {k:.4g}: give four times as much")
             raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")
+
+
+def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:
+    """How far supports can move before what they hold meets, and why no farther: the end, and no words, if they can.
+
+    What two supports hold does not give way. Nodes stand for it, so that edges which cross are not seen.
+    """
+    model, comm, dim = scene.model, scene.comm, 2 if scene.model.axisymmetric else 3
+    if name not in scene.motions or not model.touchings:
+        return end, ""
+    fixed = np.zeros(model.system.size, dtype=bool)
+    for bc in model.system.clamped:
+        dofs = bc.dof_indices()[0]
+        fixed[dofs[dofs < len(fixed)]] = True
+    held = np.flatnonzero(np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1))
+    begin = state.mu[name]
+
+    def met(part: float) -> str:
+        at = state.with_(state.u, name, begin + part * (end - begin))
+        u = np.concatenate(comm.allgather(model.system.with_ghosts(at.u, at.mu)[: model.system.size])).reshape(-1, dim)
+        for each in model.touchings:
+            if each.held_gap(held, u) < -each.pair.bound * scene.problem.material.h:
+                return each.pair.words
+        return ""
+
+    parts = np.linspace(0.0, 1.0, WAYS)
+    first = next((i for i in range(1, WAYS) if met(parts[i])), None)
+    if first is None or met(0.0):
+        return end, ""
+    low, high = parts[first - 1 : first + 1]
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if met(middle) else (middle, high)
+    return float(begin + low * (end - begin)), met(high)
 
 
 def pressing(scene: Scene, state: State) -> list[Contact]:

@@ -36,7 +36,7 @@ from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
-from magshell_fenicsx.simulate.touch import stiffnesses
+from magshell_fenicsx.simulate.touch import stiff_for, stiffnesses
 from magshell_fenicsx.simulate.walked import Records
 
 Array = NDArray[np.float64]
@@ -72,6 +72,19 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     places = in_space(model.r0.x.array, len(axes))
     velocity = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
     return np.asarray(model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]))
+
+
+def thrown(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
+    """The clock of the state before a step, with the energy of its initial velocity; empty without one."""
+    v = by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
+    if load.push and load.push.velocity:
+        v = pushed(scene, load.push, state, v)[1]
+    if not max_abs(scene.comm, v):
+        return {}
+    x, Mx = (M := mass(scene.model)).createVecs()
+    x.setArray(v)
+    M.mult(x, Mx)
+    return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}
 
 
 def own_time(value: Time) -> float:
@@ -157,6 +170,8 @@ class Pressings:
     ----------
     names
         The approaches.
+    settings
+        Names of the stiffnesses between shells.
     """
 
     def __init__(
@@ -164,7 +179,23 @@ class Pressings:
     ) -> None:
         self._system, self._pressings, self._between = system, list(pressings.values()), between
         self.names = frozenset(pressings)
+        self.settings = frozenset(contact.pair.setting for contact in between)
         self._begin: tuple[Vector, _Ends] | None = None
+
+    def harder(self, begin: State, v: Vector) -> dict[str, float]:
+        """Settings of pairs of shells that do not touch, and may meet too fast for their penalty."""
+        if not self._between:
+            return {}
+        comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
+        fastest = np.max(comm.allgather(np.max([nodes, -nodes], axis=1, initial=0.0)), axis=0)
+        speed = float(np.linalg.norm(fastest.sum(axis=0)))  # of no two places relative to each other is it larger
+        wanted = {each.pair: stiff_for(each.pair, speed, self._system.length) for each in self._between}
+        at, found = self._system.at(begin), dict[str, float]()
+        for each in self._between:
+            k = begin.mu.get(each.pair.setting, each.pair.stiffness)
+            if wanted[each.pair] > k and not each.pair.given and at.of(each.penetration) <= 0:
+                found[each.pair.setting] = wanted[each.pair]
+        return found
 
     def along(self, begin: State, end: State, part: float) -> None:
         """Take the forces of a step at a part of it."""

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
 
 Array = NDArray[np.float64]
 h, WIDTH, GAP, CLAMP, DOWN = 0.01, 0.02, 0.5, 1.6, 0.2
@@ -104,3 +105,25 @@ def test_strips_that_meet_flat() -> None:
     forces = [2 * np.pi * force for label, force in points if label == "target"]  # over D
     assert forces == pytest.approx([12 * width * (part * way - gap) * h for part in (0.5, 1)], rel=2e-3)
     assert len(points) <= 6
+
+
+def test_clamps_that_meet_end_the_path_at_once() -> None:
+    """Two strips, 3 h apart: the clamp of the upper one goes down 4 h, and its face is at the other one after 2 h."""
+    strip = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0}
+    one: dict[str, Any] = {"shell": strip, "boundary": {"left": "clamped"}, "points": {"tip": [1, 0, 0]}}
+    case = {
+        "shells": {"lower": one, "upper": {**one, "place": {"position": [0, 0, 0.06]}}},
+        "contact": [["lower", "upper"]],
+        "loading": {
+            "kind": "edge",
+            "moves": [{"supports": ["upper.left"], "translation": [0, 0, -0.08]}],
+            "points": 5,
+        },
+        "mesh": {"size": 0.2},
+    }
+    found = []
+    with pytest.raises(Stopped, match=r"supports hold lower and upper in each other from motion = 0\.500"):
+        found.extend(follow(Scene(Case.from_source(case))))
+    assert [record.point.state.mu["motion"] for record in found if record.label == "target"] == pytest.approx(
+        [0.2, 0.4]
+    )

@@ -12,6 +12,7 @@ from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
 
 Array = NDArray[np.float64]
 DISC = {
@@ -120,3 +121,48 @@ def test_a_plane_with_a_position_beside_several_shells() -> None:
     floor = {"kind": "plane", "position": ["0 mm", "0 mm", "-0.7 mm"], "direction": [0, 0, 1]}
     (contact,) = Case.from_source(DISCS | {"loading": [THROWN], "bodies": {"floor": floor}}).problem().loads.contacts
     assert contact.front == pytest.approx([0, 0, -0.7 / 50], abs=1e-12)
+
+
+@pytest.mark.parametrize(("symmetry", "mesh"), [("axisymmetric", MESHES["axisymmetric"]), ("half", {"degree": 2})])
+def test_the_start_row_has_the_energy_of_the_initial_velocity(symmetry: str, mesh: dict[str, float]) -> None:
+    """m v^2/2 of two discs that move as (1 - r^2)^2, whose square has the mean 1/5; over E h R^2."""
+    case = Case.from_source(Source("test", DISCS | {"loading": [THROWN], "symmetry": symmetry, "mesh": mesh}))
+    v = 0.05 / np.sqrt(1e6 / 1000)  # over the speed of waves
+    assert next(follow(Scene(case))).clock["kinetic"] == pytest.approx(2 * np.pi * v**2 / 2 / 5, rel=1e-3)
+
+
+@pytest.mark.parametrize(("speed", "harder"), [(5.0, 1), (20.0, 16)])
+def test_equal_plates_that_meet_flat_exchange_their_velocities(speed: float, harder: int) -> None:
+    """One flies (the foundation is 1e-9 of what its inertia needs), one rests: afterwards it is the other one.
+
+    A pair as fast as this goes sqrt(m/(2k)) v deep, 0.15 h at 20 m/s with the penalty of shells at rest.
+    """
+    rim = {"boundary": {"rim": {"held": ["x", "y"]}}}
+    shells = {name: {**shell, **rim} for name, shell in DISCS["shells"].items()}
+    thrown = {"kind": "time", "velocity": ["0", "0", f"-{speed}*z/0.0015"], "rho_inf": 1.0, "points": 2}
+    thrown["duration"] = 1e-3 / speed  # twice the time to the impact
+    base = DISCS | {"shells": shells, "foundation": {"stiffness": 1.0}, "symmetry": "none", "mesh": MESHES["half"]}
+    scene = Scene(Case.from_source(Source("test", base | {"loading": [thrown]})))
+    start, *_, end = follow(scene)
+    high = scene.model.r0.x.array.reshape(-1, 3)[:, 2] > 0.01
+    v = end.point.du.reshape(-1, 3)[:, 2] * np.sqrt(1e6 / 1000)
+    assert np.abs(v[high]).max() < 1e-6 * speed
+    assert np.abs(v[~high] + speed).max() < 1e-6 * speed
+    assert end.clock["kinetic"] == pytest.approx(start.clock["kinetic"], rel=1e-6)
+    assert abs(end.clock["imbalance"]) < 1e-9 * start.clock["kinetic"]
+    pair = scene.model.touchings[0].pair
+    assert end.point.state.mu.get(pair.setting, pair.stiffness) == harder * pair.stiffness
+
+
+def test_a_given_stiffness_stays_and_a_motion_says_what_to_give() -> None:
+    """The same discs as above, clapping at 20 m/s: without a stiffness they end, see the balance there."""
+    thrown = THROWN | {"velocity": ["0", "0", CLAP.replace("0.05", "20")], "step": 2e-6, "duration": 3e-5, "points": 3}
+    base = DISCS | {"loading": [thrown], "symmetry": "axisymmetric", "mesh": MESHES["axisymmetric"]}
+    own = found_of(base)
+    assert own[-1]["contact_penalty"] > own[0]["contact_penalty"]
+    assert own[-1]["contact_force"] > 0
+    assert abs(own[-1]["imbalance"]) < 1e-6 * own[0]["kinetic"]
+    with pytest.raises(Stopped, match=r"contact: stiffness: is 1e.05: give four times as much"):
+        found_of(base | {"contact": [{"between": ["low", "high"], "stiffness": 1e5}]})
+    given = found_of(base | {"contact": [{"between": ["low", "high"], "stiffness": 4e6}]})
+    assert {row["contact_penalty"] for row in given} == {4e6}

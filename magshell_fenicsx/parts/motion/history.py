@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, number_and_unit, with_unit
@@ -23,7 +23,7 @@ def measured(unit: str) -> Any:
         in_units(unit)(value)
         return value
 
-    return Annotated[float | with_unit(unit), AfterValidator(check)]
+    return Annotated[float | str, BeforeValidator(check, json_schema_input_type=float | with_unit(unit))]
 
 
 def _level(value: float | str) -> float | str:

@@ -94,6 +94,11 @@ class Faces:
         self.undeformed = np.asarray(self._volumes[0] / self._sum(slice(None), J0))
 
     @property
+    def constant(self) -> bool:
+        """Whether the thickness does not depend on the displacement."""
+        return not len(self._thin)
+
+    @property
     def value(self) -> float:
         """Of the amplitude at present."""
         return float(self.grown.value) if self.grown is not None else 0.0
@@ -108,7 +113,7 @@ class Faces:
 
     def slope(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
-        if not len(self._thin):
+        if self.constant:
             return np.zeros_like(u)
         return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(-1, 3))
 
@@ -119,7 +124,9 @@ class Faces:
 
     def change(self, u: Array, w: Array) -> Array:
         """What H (nodes,) changes by along w (nodes, 3)."""
-        return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel() if len(self._thin) else 0 * u[:, 0])
+        return np.asarray(
+            self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel() if not self.constant else 0 * u[:, 0]
+        )
 
     def ratio(self, u: Array) -> tuple[Array, Array]:
         """The volumes and areas (nodes,) whose ratio is H."""
@@ -175,7 +182,7 @@ class Faces:
         """
         rows, columns, values = entries
         size, count = 4 * len(f), 3 * len(f)
-        if not len(self._thin):  # H stays
+        if self.constant:  # H stays
             of_places = (rows < count) & (columns < count)
             return rows[of_places], columns[of_places], values[of_places]
         which = np.zeros(size, dtype=bool)
@@ -187,7 +194,7 @@ class Faces:
 
     def around(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
         """Pairs of nodes that act on each other, where places and thickness at pairs of nodes do."""
-        if not len(self._thin):
+        if self.constant:
             return rows, columns
         nodes, count = self._places, len(self._r0)
         has = np.repeat(np.arange(len(nodes)), nodes.shape[1])

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -162,6 +163,24 @@ class Facing:
         pairs = i[mine[i]], j[mine[i]]
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
+
+    def held_gap(self, held: Longs, u: Array) -> float:
+        """The least one, over R, between faces at nodes that supports hold, at a displacement of all nodes.
+
+        Of those that may touch and are no neighbours undeformed; infinite without, or if the shell thins.
+        """
+        if self._faces and not self._faces.constant:
+            return np.inf
+        cell_of = np.zeros(len(self._r0), dtype=np.int64)
+        cell_of[self._cells.nodes.ravel()] = np.repeat(np.arange(len(self._cells.nodes)), self._cells.nodes.shape[1])
+        cells, before, half = cell_of[held], self._r0[held], self.half[held]
+        thickness = half[:, None] + half
+        i, j = np.nonzero(scipy.spatial.distance.cdist(before, before) > (1 - SAME) * thickness)
+        near = np.linalg.norm(before[i] + u[held[i]] - before[j] - u[held[j]], axis=1) - thickness[i, j]
+        counts = near < 0
+        i, j, near = i[counts], j[counts], near[counts]
+        apart = self._allowed(cells[i], cells[j]) & ~self._is_beside(cells[i] * len(self._cells.nodes) + cells[j])
+        return float(near[apart].min(initial=np.inf))
 
     def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement, within a distance of

@@ -84,8 +84,9 @@ class Kept(Generic[Of]):
 
     def of(self, at: Sequence[Any], find: Callable[[], Of]) -> Of:
         """What is found at a place, a sequence of arrays and numbers."""
-        for place, found in self._found:
+        for i, (place, found) in enumerate(self._found):
             if all(map(np.array_equal, place, at)):
+                self._found.append(self._found.pop(i))  # the begin of a step is there at each iteration
                 return found
         new = find()
         self._found = [*self._found[1 - len(SIMPSON) :], ([np.array(each) for each in at], new)]
@@ -110,6 +111,9 @@ class InSteps(Protocol):
     @property
     def where(self) -> Array:
         """The displacement of all that is faced; collective."""
+
+    def penetration(self) -> float:
+        """The largest, over R; collective."""
 
     def passes(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface between two of these; collective."""

@@ -26,10 +26,10 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
-from magshell_fenicsx.parts.touching.curves import SIGNS, Curves, Faced, distances, nowhere, slopes
+from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Close, Curves, Faced, distances, nowhere, slopes
 from magshell_fenicsx.parts.touching.facing import STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import BULGE, FOLLOWING
+from magshell_fenicsx.parts.touching.nearest import FOLLOWING
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
 
@@ -84,6 +84,7 @@ class MeridianTouching:
         self.look: Look | None = None
         self._looked_at = Kept[tuple[Array, Faced]]()
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
+        self._close = Close(self._rule, self._nodes, sides, V.element.basix_element)
 
     # as a term
 
@@ -137,8 +138,8 @@ class MeridianTouching:
         return pairs_of(np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1))
 
     def _touching_cells(self) -> Longs:
-        at = self._pressed()
-        return np.unique(np.column_stack([self._rule.cell[at.point], at.cell]), axis=0)
+        both = [np.column_stack([self._rule.cell[at.point], at.cell]) for at in of_each(self, self._pressed)]
+        return np.asarray(np.unique(np.concatenate(both), axis=0))
 
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
@@ -210,7 +211,12 @@ class MeridianTouching:
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach."""
-        least = self._found(self._now(), self._far).distance.min(initial=np.inf)
+        u = self._now()
+        x, (one, other) = self._x_of(r := self._placed(u)), (np.unique(self._nodes[side]) for side in self._sides)
+        first = self._rule.first
+        ways = [x[first][:, None] - r[other], x[~first][:, None] - r[one]]
+        to_nodes = min(float(distances(way).min()) for way in ways)  # no place is farther
+        least = self._found(u, min(self._far, to_nodes * (1 + SAME))).distance.min(initial=np.inf)
         return float(least - self._h) if np.isfinite(least) else np.nan
 
     def penetration(self) -> float:
@@ -223,6 +229,13 @@ class MeridianTouching:
         here = np.sum(self._rule.shape[at.point] * half[self._rule.cell[at.point]], axis=1)
         there = np.sum(self._curves.table(0, at.X)[0] * half[at.cell], axis=1)
         return float(((self._h - at.distance) / (here + there)).max(initial=0.0))
+
+    def held_gap(self, held: Longs, u: Array) -> float:
+        """See `Facing.held_gap`."""
+        one, other = (np.intersect1d(held, self._nodes[side]) for side in self._sides)
+        r, half = self._r0 + u, self._half
+        away = np.linalg.norm(r[one][:, None] - r[other], axis=2) - half[one][:, None] - half[other]
+        return float(away.min(initial=np.inf))
 
     def refuse_overlap(self) -> None:
         """See that the shells do not overlap undeformed.
@@ -335,22 +348,9 @@ class MeridianTouching:
     def _found(self, u: Array, of_faces: float, *, faces: bool = True) -> Faced:
         """The places that points face within a distance of faces or mid-surfaces at a displacement: one on each side of
         a point at most."""
-        r, rule = self._placed(u, faces=faces), self._rule
-        reach = of_faces + 2 * float(r[:, 2].max())
+        r = self._placed(u, faces=faces)
         x, nodal = self._x_of(r), r[self._nodes]
-        centres = nodal[..., :2].mean(axis=1)
-        radii = BULGE * np.linalg.norm(nodal[..., :2] - centres[:, None], axis=2).max(axis=1)
-        parts = list[tuple[Longs, Longs]]()
-        for mine, others in zip((rule.first, ~rule.first), self._sides[::-1], strict=True):
-            near, cells = np.unique(rule.cell[mine]), np.flatnonzero(others)
-            far = np.linalg.norm(centres[near][:, None] - centres[cells], axis=2) - radii[cells] - reach
-            within = np.zeros(len(nodal), dtype=bool)
-            within[near] = (far < radii[near][:, None]).any(axis=1)
-            points, cells = np.flatnonzero(mine & within[rule.cell]), cells[(far < radii[near][:, None]).any(axis=0)]
-            away = np.linalg.norm(x[points, None, :2] - centres[cells], axis=2)
-            i, j = np.nonzero(away < radii[cells] + reach)
-            parts.append((points[i], cells[j]))
-        point, cell = (np.concatenate(each) for each in zip(*parts, strict=True))
+        point, cell = self._close(x[:, :2], nodal[..., :2], of_faces + 2 * float(r[:, 2].max()))
         if not len(point):
             return nowhere()
         at = self._curves.projected(x, nodal, point, cell)

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
+from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -18,10 +19,30 @@ if TYPE_CHECKING:
 WHOLE = "shell"
 KEEP_THICKNESS = ("koiter", "laminate")  # laws
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
-Pairs = Annotated[
-    list[Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]],
-    Field(max_length=20),
+Both = Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]
+
+
+class PairSection(Section):
+    """A pair of `contact` with more than its names."""
+
+    between: Both
+    """What may touch"""
+    stiffness: float | None = Field(default=None, gt=0, le=1e12)
+    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²), and four times as much each time
+    that the penetration would exceed 1e-3 h, in a motion 0.1 h for a moment; a given one stays, and the run stops where
+    the penetration is more [E h/R²]"""
+
+
+GivenPair = Annotated[
+    Annotated[Both, Tag("a pair")] | Annotated[PairSection, Tag("a pair with keys")],
+    Discriminator(lambda data: "a pair with keys" if isinstance(data, dict | PairSection) else "a pair"),
 ]
+Pairs = Annotated[list[GivenPair], Field(max_length=20)]
+
+
+def names_in(pair: GivenPair) -> list[str]:
+    """Of a pair as a case has it."""
+    return pair.between if isinstance(pair, PairSection) else pair
 
 
 @dataclass(frozen=True)
@@ -38,12 +59,15 @@ class Pair:
         k of the penalty, over E h/R^2.
     bound
         Largest penetration that is allowed, over the thickness there.
+    given
+        Whether the case gives its stiffness, which then stays.
     """
 
     names: tuple[str, str]
     suffix: str
     stiffness: float
     bound: float = 1e-3
+    given: bool = False
 
     @property
     def setting(self) -> str:
@@ -61,7 +85,7 @@ class Pair:
         return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
 
 
-class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
+class ShellContact(KeyAbility[Sequence[GivenPair]]):
     """All pairs of a case that may touch."""
 
     key = "contact"
@@ -72,9 +96,10 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """All planes: a half sees its image. The meridian where shells that keep their thickness touch each other."""
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        names, laws = {name for pair in self.given for name in pair}, several.laws if several else {}
+        pairs = [names_in(pair) for pair in self.given]
+        names, laws = {name for pair in pairs for name in pair}, several.laws if several else {}
         why = None
-        if not names <= {*laws} or any(one == other for one, other in self.given):
+        if not names <= {*laws} or any(one == other for one, other in pairs):
             why = "contact: a shell that may touch itself is modelled with its circumference"
         elif any(laws[name] not in KEEP_THICKNESS for name in names):
             why = "contact: shells that get thinner as they stretch are modelled with their circumference"
@@ -85,7 +110,7 @@ class ShellContact(KeyAbility[Sequence[Sequence[str]]]):
         return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.moduli if several else {})}
 
 
-def pairs(given: Sequence[Sequence[str]], nu: float, moduli: Mapping[str, float]) -> tuple[Pair, ...]:
+def pairs(given: Sequence[GivenPair], nu: float, moduli: Mapping[str, float]) -> tuple[Pair, ...]:
     """What a case's pairs are in a model.
 
     Parameters
@@ -93,16 +118,14 @@ def pairs(given: Sequence[Sequence[str]], nu: float, moduli: Mapping[str, float]
     moduli
         Of several shells: name -> Young's modulus over E; the penalty is that of the softer one.
     """
-    k = STIFF / (12 * (1 - nu**2))
-    several = len(given) > 1
-    return tuple(
-        Pair(
-            (one, other),
-            f"_{one}_{other}" if several else "",
-            k * min([*_of_shells(one, moduli), *_of_shells(other, moduli)], default=1.0),
-        )
-        for one, other in given
-    )
+    k, made = STIFF / (12 * (1 - nu**2)), list[Pair]()
+    for pair in given:
+        one, other = names_in(pair)
+        softer = min([*_of_shells(one, moduli), *_of_shells(other, moduli)], default=1.0)
+        own = pair.stiffness if isinstance(pair, PairSection) else None
+        suffix = f"_{one}_{other}" if len(given) > 1 else ""
+        made.append(Pair((one, other), suffix, own or k * softer, given=own is not None))
+    return tuple(made)
 
 
 def _of_shells(name: str, values: Mapping[str, float]) -> list[float]:
@@ -110,7 +133,7 @@ def _of_shells(name: str, values: Mapping[str, float]) -> list[float]:
     return [value for shell, value in values.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
 
 
-def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None:
+def refuse_unfit_pairs(given: Sequence[GivenPair], context: Context) -> None:
     """See that a model can have these contacts.
 
     Raises
@@ -119,7 +142,7 @@ def refuse_unfit_pairs(given: Sequence[Sequence[str]], context: Context) -> None
         With the key and what is allowed.
     """
     seen, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
-    for i, pair in enumerate(given):
+    for i, pair in enumerate(map(names_in, given)):
         if frozenset(pair) in seen:
             raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
         seen.add(frozenset(pair))
@@ -152,6 +175,7 @@ def account(context: Context, loads: "Loads") -> Account:
     return Account(
         [
             f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"
+            + (", as given" if pair.given else "")
             for pair in loads.pairs
         ]
     )

@@ -305,6 +305,10 @@ class Touching:
         least = self._facing.found(self._of_copies(u), self._far).distance.min(initial=self._far)
         return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
 
+    def held_gap(self, held: Longs, u: Array) -> float:
+        """See `Facing.held_gap`."""
+        return self._facing.held_gap(held, self._of_copies(u))
+
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
 
