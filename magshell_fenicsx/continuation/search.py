@@ -27,18 +27,16 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.bifurcation import largest
 from magshell_fenicsx.continuation.control import Bordered, GivenConjugate, Metric, Row, plus
+from magshell_fenicsx.continuation.device import FORCE, HeldAlong
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import (
-    Amplitudes,
     State,
     System,
-    Tangent,
     Vector,
-    Weighted,
     dot,
     max_abs,
     symmetric_part,
@@ -51,7 +49,6 @@ NEAR_ONE = 2.0  # there the deflation must change the step by less than this fac
 BENT = 0.5  # part of a step that the linear model may leave unexplained
 LEAST = 1e-3  # where a shorter part of a step would be needed, a singular tangent is near
 LEAP, MOST_LEAPS = 1.0, 4  # in lengths of the system: a step over it
-FORCE = "holding force"
 FIRST, LONGEST, SHORTEST = 0.02, 1000.0, 1e-3  # steps: the first in the metric's length, others over the first
 MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
 MOST_BRACKETS, LITTLE = 4, 1e-2  # solves for the zero of the force; this part of its change counts as zero
@@ -140,34 +137,6 @@ def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: S
     return None
 
 
-class Held:
-    """A system with one more amplitude, a force along b."""
-
-    def __init__(self, system: System, b: Vector) -> None:
-        self.comm, self.size, self.length, self.coordinates = (
-            system.comm,
-            system.size,
-            system.length,
-            system.coordinates,
-        )
-        self._system, self._b = system, b
-
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._system.residual(u, mu) + mu[FORCE] * self._b
-
-    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        return self._b if name == FORCE else self._system.load(u, mu, name)
-
-    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        return dot(self.comm, self._b, u) if name == FORCE else self._system.potential(u, mu, name)
-
-    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        return 0.0 if FORCE in (name, other) else self._system.curvature(u, mu, name, other)
-
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
-        return self._system.tangent(u, mu, stress)
-
-
 def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]:
     """Guesses of equilibria on the path of a force along b that holds a guess, each where the force is zero.
 
@@ -176,7 +145,7 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     system = newton.system
     residual, size = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
     b = np.asarray(b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0))  # a force of order one
-    holder = newton.on(Held(system, b))
+    holder = newton.on(HeldAlong(system, b))
     first = -dot(system.comm, b, residual) / dot(system.comm, b, b)
     row = GivenConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
     near = deflated(holder, State(guess.u, {**guess.mu, FORCE: first}), FORCE, row)

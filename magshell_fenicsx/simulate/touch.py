@@ -95,13 +95,32 @@ def recut(stage: Stage, low: Point, high: Point) -> State | None:
 
     None if these would not be much better.
     """
-    touchings = [each for each in stage.scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
-    if not touchings:
-        return None
-    at = stage.scene.model.system.at(stage.leave(high.state))
-    numbers = {each.pair.cuts: at.of(each.recut) for each in touchings}
-    changed = {name: number for name, number in numbers.items() if number is not None}
+    changed = better_cuts(stage.scene, stage.leave(high.state))
     return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+
+def better_cuts(scene: Scene, state: State) -> dict[str, float]:
+    """The numbers of cuts at a state that are much better than those it has; collective."""
+    at = scene.model.system.at(state)
+    numbers = {each.pair.cuts: at.of(each.recut) for each in _with_cuts(scene)}
+    return {name: number for name, number in numbers.items() if number is not None}
+
+
+def with_cuts_here(scene: Scene, state: State) -> State:
+    """A state, as one that another model gives, with the cuts of shells at its own displacement; collective."""
+    at = scene.model.system.at(state)
+    return State(state.u, {**state.mu, **{each.pair.cuts: at.of(each.numbered) for each in _with_cuts(scene)}})
+
+
+def _with_cuts(scene: Scene) -> list[Touching]:
+    return [each for each in scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
+
+
+def of_its_own(scene: Scene, state: State) -> State | None:
+    """A state with penalties that are stiffer where shells or bodies are too deep in each other, and with cuts of its
+    own; None if it needs none of these. Collective."""
+    changed = {**stiffnesses(scene, state), **better_cuts(scene, state)} if scene.model.touchings else {}
+    return State(state.u, {**state.mu, **changed}) if changed else None
 
 
 def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
@@ -143,6 +162,15 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
                 final=True,
             )
     _refuse_through(touchings, whole)
+
+
+def passes(stage: Stage, low: Point, high: Point) -> bool:
+    """Whether a shell passes through another one, itself or a mirror plane on the straight way between two points."""
+    try:
+        refuse_passing(stage, low, high)
+    except (StepTooLong, PathStopped):
+        return True
+    return False
 
 
 def _refuse_through(

@@ -353,6 +353,10 @@ class Touching:
         counted = places.of(~self._facing.left_to_edges(points, places, normals))
         return self._cuts.numbered(u) if self._astray(points, counted) < astray / 2 else None
 
+    def numbered(self) -> float:
+        """The number of the present displacement, for cuts there; collective."""
+        return self._cuts.numbered(self._now())
+
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
         """The part of the force at points that do not face what they faced, or on what is `turned`."""
         other = at.of(points.faces[at.point] != at.cell)
