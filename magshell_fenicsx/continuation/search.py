@@ -60,6 +60,7 @@ RESTED = 0.05  # in lengths of the system: a shorter step with so small a shift 
 SMALL = 0.01
 COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
 MODE, DOWN = 1.0, 0.3  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
+MOST_CHANGED = 10  # times that a solution gets stiffer penalties or new cuts
 DESCENTS = 20  # times that a guess goes on settling
 OVER = "the time of the search is over"
 
@@ -190,14 +191,17 @@ class Settling:
     ----------
     unloaded
         A state with a positive definite tangent K0.
+    passes
+        Whether a step must not be gone, as shells would pass through each other.
     """
 
     system: System
     unloaded: State
+    passes: Callable[[State, State], bool] = lambda here, ahead: False
 
     def __post_init__(self) -> None:
         K = symmetric_part(self.system.tangent(self.unloaded.u, self.unloaded.mu))
-        self._K0, self._shifted = K.copy(), K.copy()
+        self._K0 = K.copy()
         self._stiff, self._factors = Factorisation(self.system.comm), Factorisation(self.system.comm)
         self._stiff.factor(self._K0)
 
@@ -209,16 +213,16 @@ class Settling:
             K = symmetric_part(system.tangent(u, guess.mu)).copy()
             while spent < MOST_FACTORS:
                 spent += 1
-                K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                self._shifted.axpy(shift, self._K0, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                self._factors.factor(self._shifted)
+                shifted = K.copy()
+                shifted.axpy(shift, self._K0, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)  # K has what touches too
+                self._factors.factor(shifted)
                 if self._factors.negative_pivots:
                     shift *= 2
                     continue
                 du = -self._factors.solve(residual)
                 ahead = system.residual(u + du, guess.mu)
                 left = self._size(ahead + shift * self._stiff.times(du)) / self._size(residual)
-                if left <= UNEXPLAINED:
+                if left <= UNEXPLAINED and not self.passes(State(u, guess.mu), State(u + du, guess.mu)):
                     u, residual = u + du, ahead
                     ends = shift < SMALL and max_abs(system.comm, du) <= RESTED * system.length
                     shift /= 4 if left < EASY else 1
@@ -250,11 +254,35 @@ class Limits:
     over: Callable[[], bool] = lambda: False
 
 
-class Guess:
-    """A guess, made when it is needed, and the direction in which it is away from a known solution."""
+@dataclass(frozen=True)
+class Rules:
+    """What solutions of shells that may touch have to keep.
 
-    def __init__(self, make: Callable[[], State], base: State, displacement: Callable[[Vector], Vector]) -> None:
-        self._make, self._base, self._displacement = make, base, displacement
+    Attributes
+    ----------
+    passes
+        Whether shells pass through each other on the straight way between two states.
+    own
+        A solution with penalties and cuts of its own, to be solved again; None if it has them.
+    """
+
+    passes: Callable[[State, State], bool] = lambda here, there: False
+    own: Callable[[State], State | None] = lambda state: None
+
+
+class Guess:
+    """A guess, made when it is needed, and the direction in which it is away from a known solution.
+
+    Attributes
+    ----------
+    reached
+        Whether a way without shells that pass through each other leads there.
+    """
+
+    def __init__(
+        self, make: Callable[[], State], base: State, displacement: Callable[[Vector], Vector], *, reached: bool
+    ) -> None:
+        self._make, self._base, self._displacement, self.reached = make, base, displacement, reached
 
     @cached_property
     def state(self) -> State:
@@ -272,6 +300,7 @@ def further(
     limits: Limits,
     displacement: Callable[[Vector], Vector] = lambda u: u,
     descend: Callable[[State], State] | None = None,
+    rules: Rules | None = None,
 ) -> Iterator[Point]:
     """Solutions at the amplitudes of a known one, each accepted as a point of the path is.
 
@@ -282,14 +311,16 @@ def further(
     start
         A solution.
     guesses
-        Further guesses, which are tried first.
+        Further guesses, which are tried first; ways lead there on which no shells pass through each other.
     displacement
         A vector of the system with zeros for unknowns that are no displacements.
     descend
         Lets a state go down in energy by some steps; then only stable solutions count. None: all count.
+    rules
+        Of shells that may touch.
     """
-    search = _Search(path, [start], descend, limits.over)
-    queue = [Guess(make, start, displacement) for make in guesses]
+    search = _Search(path, [start], descend, limits.over, rules or Rules())
+    queue = [Guess(make, start, displacement, reached=True) for make in guesses]
     queue += search.along_mode(start, displacement)
     accepted = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
@@ -300,7 +331,7 @@ def further(
             point = path.recorded(partial(_unless, limits.over, attempt, guess))
             if point == OVER:
                 return
-            if isinstance(point, str):
+            if isinstance(point, str) or isinstance(point := search.kept(guess, point), str):
                 continue
             search.known.append(point.state)
             queue += search.along_mode(point.state, displacement)
@@ -331,13 +362,40 @@ class _Search:
     """
 
     def __init__(
-        self, path: Path, known: list[State], descend: Callable[[State], State] | None, over: Callable[[], bool]
+        self,
+        path: Path,
+        known: list[State],
+        descend: Callable[[State], State] | None,
+        over: Callable[[], bool],
+        rules: Rules,
     ) -> None:
-        self._path, self.known, self._descend, self._over = path, known, descend, over
+        self._path, self.known, self._descend, self._over, self._rules = path, known, descend, over, rules
         self._system, self._newton = path.system, path.newton
         self._solver = Path(path.newton, path.name, "load", path.options)  # without a journal
         self._value = known[0].mu[path.name]
         self._row = path.given("load", self._value)
+
+    def kept(self, guess: Guess, point: Point) -> Point | str:
+        """A solution as the rules ask for it, or why it is none: every known one is reached without passing through."""
+        for _ in range(MOST_CHANGED):
+            if (own := self._rules.own(point.state)) is None:
+                break
+            again = self._path.recorded(partial(self._again, own))
+            if isinstance(again, str):
+                return again
+            point = again
+        else:
+            return "the shells that touch have no cuts and penalties that last"
+        if self._is_known(point.state):
+            return "the solution is a known one"
+        begins = [*self.known, *([guess.state] if guess.reached else [])]
+        if all(self._rules.passes(begin, point.state) for begin in begins):
+            return "shells have passed through each other"
+        return point
+
+    def _again(self, state: State) -> Point | str:
+        point = self._solver.solve(self._row, self._value, state)
+        return point if isinstance(point, str) else self._solver.exact(point, point)
 
     def by_newton(self, guess: Guess) -> Point | str:
         """The solution that deflated Newton's method finds from a guess."""
@@ -377,7 +435,7 @@ class _Search:
     def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:
         """Guesses on both sides of a solution along its softest mode."""
         mode = _Mode(self._path, state)
-        return [Guess(partial(mode.state, size), state, displacement) for size in (MODE, -MODE)]
+        return [Guess(partial(mode.state, size), state, displacement, reached=False) for size in (MODE, -MODE)]
 
     def _accepted(self, guess: State) -> Point | str:
         path = self._path

@@ -156,6 +156,7 @@ def _of_shells(
 ) -> dict[str, Vector]:
     """That of each of several shells."""
     model = scene.model
+    own: Mapping[str, NDArray[np.bool_]]
     if model.midsurface:
         cells = model.midsurface.mesh.topology.index_map(2)
         own, count = model.midsurface.patches, cells.size_local + cells.num_ghosts

@@ -29,6 +29,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+HALVINGS = 8  # of a way on which shells would pass through each other
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
@@ -164,10 +165,11 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     _refuse_through(touchings, whole)
 
 
-def passes(stage: Stage, low: Point, high: Point) -> bool:
+def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
     """Whether a shell passes through another one, itself or a mirror plane on the straight way between two points."""
+    ends = (end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0) for end in (low, high))
     try:
-        refuse_passing(stage, low, high)
+        refuse_passing(stage, *ends)
     except (StepTooLong, PathStopped):
         return True
     return False
@@ -196,6 +198,18 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
             ends.append((model.system.at(state).of(partial(getattr, field, "places")), state.mu))
         if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
+
+
+def before_passing(stage: Stage, low: State, high: State) -> State:
+    """The second of two states of a stage, or one on the straight way to it, before shells pass through each other."""
+    if not stage.scene.model.touchings or not passes(stage, low, high):
+        return high
+    part, beyond, way = 0.0, 1.0, high.u - low.u
+    for _ in range(HALVINGS):
+        middle = (part + beyond) / 2
+        through = passes(stage, low, State(low.u + middle * way, high.mu))
+        part, beyond = (part, middle) if through else (middle, beyond)
+    return State(low.u + part * way, high.mu)
 
 
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
