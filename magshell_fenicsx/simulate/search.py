@@ -25,6 +25,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, plain, staged
 from magshell_fenicsx.simulate.steps import held_by
 from magshell_fenicsx.simulate.touch import before_passing, of_its_own, passes
+from magshell_fenicsx.simulate.transfer import nodes_of_shells
 
 Array = NDArray[np.float64]
 DEPTHS = 0.9, 0.03, 0.8, 0.2  # of the dents, over the height of the shell above its supports
@@ -39,28 +40,12 @@ def dented(scene: Scene, state: State) -> Iterator[State]:
     """Dented copies of a state, none of flat shells; of several shells each alone, then all. Collective."""
     system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
-    parts = [Curved.of(scene, x, inside) for inside in _shells(scene, len(x))]
+    parts = [Curved.of(scene, x, inside) for inside in nodes_of_shells(scene)]
     curved = [part for part in parts if part.top > LEAST * scene.problem.material.h]
     for depth in DEPTHS:
         dents = [part.dent(depth, scene.problem.material.h) for part in curved]
         for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
             yield State(state.u + system.held(dent.ravel()), dict(state.mu))
-
-
-def _shells(scene: Scene, count: int) -> list[NDArray[np.bool_]]:
-    """Which of this rank's nodes are of each shell."""
-    model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
-    if len(names) < 2:
-        return [np.ones(count, dtype=bool)]
-    patches = model.meridian.patches if model.axisymmetric else model.midsurface.patches if model.midsurface else {}
-    found = list[NDArray[np.bool_]]()
-    for name in names:
-        cells = np.flatnonzero(patches[name][: len(model.V.dofmap.list)])
-        nodes = model.V.dofmap.list[cells].ravel()
-        inside = np.zeros(count, dtype=bool)
-        inside[nodes[nodes < count]] = True
-        found.append(inside)
-    return found
 
 
 @dataclass(frozen=True)

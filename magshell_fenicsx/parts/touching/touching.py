@@ -332,8 +332,6 @@ class Touching:
         point, k = at.point[joined.first], self.stiffness.value
         return Along.of(len(self._points.weight), point, self._h - joined.distance, moves, k, SOFT * self._h)
 
-    # its history
-
     def recut(self) -> float | None:
         """The number of the present displacement, if cuts there are better than those of the state; collective.
 
