@@ -63,6 +63,8 @@ class Iterates:
         Whether steps may shrink suddenly less: then none is foreseen.
     hasty
         Whether the solve is given up early where a shorter step of the path costs less.
+    rough
+        Part of the first step up to which the error need not fall below.
     allowed
         The foreseen error up to which the last iterate was accepted.
     """
@@ -72,6 +74,7 @@ class Iterates:
     searched: bool = False
     kinks: bool = False
     hasty: bool = False
+    rough: float = 0.0
     steps: list[Step] = field(default_factory=list)
     allowed: float = 0.0
 
@@ -99,6 +102,7 @@ class Iterates:
             Computes the error from rounding of the residual.
         """
         step, before = self.steps[-1], self.steps[:-1]
+        tolerance = max(tolerance, self.rough * self.steps[0].size)
         if not step.size <= self.largest:
             return "far" if self.hasty else "diverged"
         self.allowed = SURE * tolerance * min(1.0, max(step.size for step in self.steps))

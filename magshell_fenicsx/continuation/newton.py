@@ -27,6 +27,7 @@ from magshell_fenicsx.continuation.snes import (
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
 
 SOFT = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # of the stiffness of faces that touch: the first is that of a shell
+ROUGH = 0.1  # of the first step between soft faces: their error need not fall below it, for harder ones move less
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ class BorderedNewton:
         state, iterations = guess, 0
         for part in SOFT:
             softer = {key: part * guess.mu.get(key, k) for key, k in self.options.stiffnesses.items()}
-            outcome = self._solved(self._snes, State(state.u, {**state.mu, **softer}), name, row)
+            outcome = self._solved(self._snes, State(state.u, {**state.mu, **softer}), name, row, rough=ROUGH)
             state, iterations = outcome.state, iterations + outcome.iterations
             if not outcome.converged:
                 return None
@@ -156,10 +157,11 @@ class BorderedNewton:
         most: float = np.inf,
         *,
         foreseeing: bool = False,
+        rough: float = 0.0,
     ) -> Outcome:
         linear, searched, at_most = self._linear, snes is self._searching, snes.getTolerances()[2]
         of = guess, name, row, stress, at_most
-        linear.begin(*of, searched=searched, near=near, most=most, foreseeing=foreseeing)
+        linear.begin(*of, searched=searched, near=near, most=most, foreseeing=foreseeing, rough=rough)
         linear.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()

@@ -186,8 +186,12 @@ class Linearised:
         near: float = 0.0,
         most: float = np.inf,
         foreseeing: bool = False,
+        rough: float = 0.0,
     ) -> None:
-        """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`."""
+        """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`.
+
+        `rough` is that of its `Iterates`.
+        """
         self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
         self._computed = list[float]()  # steps with computed forces
         self._tolerance, self._near = tolerance, near
@@ -195,7 +199,7 @@ class Linearised:
         patience = SEARCHED if searched else self._options.patience
         o = self._options
         kinks = o.kinks or foreseeing or bool(self._system.coordinates)  # the force of a body is stiff
-        self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, hasty=most < np.inf)
+        self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, most < np.inf, rough)
         self.matrix = self._chord = self._state = self._ahead = None
         self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 

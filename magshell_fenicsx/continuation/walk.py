@@ -332,7 +332,8 @@ class Walk:
     ----------
     renew
         The state of the first of two successive points with other amplitudes beside that of the path, from which the
-        walk goes on in place of the second; None if that is accepted. It raises `StepTooLong` if it must not be.
+        walk goes on in place of the second; None if that is accepted. It raises `StepTooLong` if it must not be. Where
+        no solution is found with such amplitudes it is asked again, and may accept the second point now.
 
     Attributes
     ----------
@@ -369,9 +370,11 @@ class Walk:
                 if state:
                     try:
                         self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
-                    except PathStopped as e:  # nearer to the first point the change is smaller
-                        shorter, why = abs(point.s - low.s) / 4, str(e)
-                    break
+                        break
+                    except PathStopped as e:
+                        if self._renew and self._renew(low, point):  # nearer to the first point the change is smaller
+                            shorter, why = abs(point.s - low.s) / 4, str(e)
+                            break
                 try:
                     between = self._between(low, point)
                 except PathStopped:  # the step had left the branch: approach in shorter steps

@@ -183,7 +183,8 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
             on_plane = halved and name in (CUT, SECOND_CUT)
             before = [edges[name]] if on_plane and name in edges else []
             edges[name if on_plane else f"{member.name}_{name}"] = np.concatenate([*before, pairs + first])
-        points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in member.points}
+        named = [name for name in patch.points if name in ("pole", *member.points)]
+        points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in named}
         every = np.ones(len(patch.cells), dtype=bool)
         for name, of in {"": every, **patch.patches}.items():
             inside = np.zeros(total, dtype=bool)

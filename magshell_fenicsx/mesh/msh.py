@@ -1,6 +1,6 @@
 """Reading a surface mesh from a file of gmsh (.msh), with triangles of order 1, 2 or 3."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -207,7 +207,8 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     Parameters
     ----------
     points
-        Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is the pole.
+        Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is the pole; of
+        several that are, the pole of one of several shells.
     mirror
         The plane whose half is read; None for the whole surface.
 
@@ -221,7 +222,8 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
         patch = file.given.patch
         on_alike = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
         others = {name: x for name, x in points.items() if name not in on_alike}
-        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale), **on_alike})
+        own = [patch.points[name] for name in map("{}_pole".format, patch.shells) if name in patch.points]
+        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale, own), **on_alike})
     try:
         patch = _whole(file)
     except MeshError as e:
@@ -278,10 +280,14 @@ def cell_count(file: MeshFile) -> int:
     return sum(len(nodes) for _, dim, _, nodes in held.blocks if dim == 2)
 
 
-def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float) -> dict[str, Array]:
+def _vertices(
+    nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float, own: Sequence[Array] = ()
+) -> dict[str, Array]:
+    """Named ones, and the highest as "pole": of several that are, one of the poles that shells have of their `own`."""
     corners = nodes[np.unique(cells[:, :3])]
-    highest = corners[np.lexsort(np.round(corners[:, :3], 9).T)[-1]]
-    vertices = {"pole": highest}
+    all_of_them = np.array([*corners, *own])
+    x, y, z = np.round(all_of_them[:, :3], 9).T
+    vertices = {"pole": all_of_them[np.lexsort((x, y, np.arange(len(x)) >= len(corners), z))[-1]]}
     for name, x in points.items():
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]

@@ -154,8 +154,25 @@ def test_a_renewal_that_fails_shortens_the_step() -> None:
     walk = Walk(path, start, Goal("points", steps=5), renew)
     steps = [point for _, point in walk]
     assert len(steps) == 5
-    assert refused[:2] == pytest.approx([0.1, 0.025])
+    assert refused[:4] == pytest.approx([0.1, 0.1, 0.025, 0.025])  # each is asked for again
     assert np.diff([start.s, *(point.s for point in steps)]).max() <= 0.02
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in")
+def test_a_renewal_that_need_not_be_leaves_the_steps() -> None:
+    """Where other amplitudes have no solution, and are not asked for again, the point that was found counts."""
+    asked, wild = list[float](), State(np.full(3, 1e200), {"load": 0.0})
+
+    def renew(low: Point, high: Point) -> State | None:
+        if low.s in asked:
+            return None
+        asked.append(low.s)
+        return wild
+
+    goal = Goal("points", steps=5)
+    steps = [point.s for _, point in Walk(*begin(0.1, 0.2), goal, renew)]
+    assert len(asked) == 5
+    assert steps == pytest.approx([point.s for _, point in walked(goal, 0.1, 0.2)], rel=1e-12)
 
 
 def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:

@@ -25,7 +25,7 @@ from magshell_fenicsx.parts.magnetism.close import Close
 from magshell_fenicsx.parts.magnetism.far import Far
 from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
-from magshell_fenicsx.parts.magnetism.tree import Grid
+from magshell_fenicsx.parts.magnetism.tree import Octree
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -177,7 +177,7 @@ class Charged:
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.of(shape.r0))
-        self._grid: Grid | None = None
+        self._octree: Octree | None = None
         self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
 
     def rules(self, nodes: Array, own: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
@@ -205,12 +205,13 @@ class Charged:
 
         They follow from where the cells are, not from where they have been.
         """
-        self._grid = self._grid or Grid(self._places, self._parts, self._groups, own, itself=self._near is not None)
+        near = self._near is not None
+        self._octree = self._octree or Octree(self._places, self._parts, self._groups, own, itself=near)
         places, radii = _balls(nodes)
         grown = np.maximum(0, np.ceil(np.log(radii / self._radii) / np.log(GROWN) - 0.5)).astype(np.int64)
-        key = np.column_stack([self._grid.moved(places), grown])
+        key = np.column_stack([self._octree.moved(places), grown])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
-            tree = self._grid.tree(key[:, :3], self._radii * GROWN ** key[:, 3] + self._h / 2)
+            tree = self._octree.tree(key[:, :3], self._radii * GROWN ** key[:, 3] + self._h / 2)
             kinds = [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
             self._boxes = key, Far(tree, kinds, own, self._pairs), tree.near
         return self._boxes[1:]

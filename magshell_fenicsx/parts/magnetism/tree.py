@@ -64,7 +64,7 @@ class Tree:
     near: NDArray[np.bool_]
 
 
-class Grid:
+class Octree:
     """Boxes for cells that move; the places of the undeformed cells choose their size.
 
     Parameters
