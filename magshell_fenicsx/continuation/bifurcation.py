@@ -8,7 +8,7 @@ imperfection, from the mesh or from rounding, splits the bifurcation; beta is th
 that cross the path are entered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import copysign
 
@@ -187,13 +187,17 @@ class Branching:
     starts: tuple[Point, Point]
 
 
-def branching(path: Path, bifurcation: Point) -> Branching | None:
+def branching(
+    path: Path, bifurcation: Point, refused: Callable[[Point, Point], bool] = lambda low, high: False
+) -> Branching | None:
     """Leave a path at a located bifurcation along the null vector; None if that or the first points are not found.
 
     Parameters
     ----------
     path
         Controlled by arc length.
+    refused
+        Whether the straight way from the bifurcation to a first point must not be gone; a nearer one is tried then.
     """
     name, state = path.name, bifurcation.state
     try:
@@ -205,7 +209,8 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
     sizes = list(SIZES)
     while sizes:
         size = sizes.pop(0)
-        starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
+        found = (_step_off(path, state, mode, signed) for signed in (size, -size))
+        starts = [point if point and not refused(bifurcation, point) else None for point in found]
         if starts[0] is None or starts[1] is None:
             if branching_point:
                 break

@@ -1,4 +1,4 @@
-"""Systems made of a system: a loading device that holds conjugates, and amplitudes as functions of one.
+"""Systems made of a system: a loading device that holds conjugates, amplitudes as functions of one, a holding force.
 
 A device holds the conjugates of some amplitudes, so these amplitudes are unknowns. For example, a sealed volume has an
 unknown pressure, and a body pressed on with a given force an unknown position. The Legendre transform
@@ -18,12 +18,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
-from magshell_fenicsx.continuation.system import Amplitudes, Edged, State, System, Tangent, Vector, Weighted, max_abs
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    Edged,
+    State,
+    System,
+    Tangent,
+    Vector,
+    Weighted,
+    dot,
+    max_abs,
+)
 
 Conjugate = Callable[[float], tuple[float, float]]  # mu -> q and dq/dmu
 Held = float | Conjugate | str
 Array = NDArray[np.float64]
 Curve = Callable[[float], tuple[float, float, float]]  # t -> mu and its first two derivatives
+FORCE = "holding force"
 
 
 class Device:
@@ -219,3 +230,31 @@ class Along:
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
         """Amplitude of the inner system -> dmu_i/dt for t; for one of its own amplitudes, itself -> 1."""
         return {i: f(mu[self._name])[1] for i, f in self._curves.items()} if name == self._name else {name: 1.0}
+
+
+class HeldAlong:
+    """A system with one more amplitude, a force along b."""
+
+    def __init__(self, system: System, b: Vector) -> None:
+        self.comm, self.size, self.length, self.coordinates = (
+            system.comm,
+            system.size,
+            system.length,
+            system.coordinates,
+        )
+        self._system, self._b = system, b
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        return self._system.residual(u, mu) + mu[FORCE] * self._b
+
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        return self._b if name == FORCE else self._system.load(u, mu, name)
+
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        return dot(self.comm, self._b, u) if name == FORCE else self._system.potential(u, mu, name)
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        return 0.0 if FORCE in (name, other) else self._system.curvature(u, mu, name, other)
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
+        return self._system.tangent(u, mu, stress)

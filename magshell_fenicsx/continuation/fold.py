@@ -18,6 +18,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from magshell_fenicsx.continuation.control import GivenConjugate
+from magshell_fenicsx.continuation.device import FORCE, HeldAlong
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import Point
@@ -116,7 +118,8 @@ def held_along(
 ) -> tuple[State, float] | None:
     """The equilibrium with the guess's component along b, which a force along b holds, and its estimated error.
 
-    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction).
+    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where forces set in within a
+    step, as between shells that touch, it is solved between soft faces first, as `BorderedNewton.solve` does.
     None if Newton's method fails. `stress` is the stress of the guess, see `System.tangent`.
 
     Raises
@@ -124,6 +127,18 @@ def held_along(
     LinAlgError
         If the tangent is singular in another direction too.
     """
+    held = _held_along(newton, guess, b, stress)
+    if held or not newton.options.kinks:
+        return held
+    row = GivenConjugate(system := HeldAlong(newton.system, b), FORCE, -dot(system.comm, b, guess.u))
+    outcome = newton.on(system).solve(State(guess.u, {**guess.mu, FORCE: 0.0}), FORCE, row)
+    return _held_along(newton, State(outcome.state.u, guess.mu), b) if outcome.converged else None
+
+
+def _held_along(
+    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
+) -> tuple[State, float] | None:
+    """The same by full steps alone."""
     system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b, stress), np.inf
     tangents, own = 1, True
     while True:

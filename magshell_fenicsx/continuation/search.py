@@ -4,12 +4,6 @@ A guess is tried in two ways: by Newton's method with all known solutions deflat
 along its displacement that holds it is released. Each solution that is found gives two more guesses, along its softest
 mode. A search for stable solutions first lets each guess settle: go down in energy until it rests at one.
 
-**Deflation.** The residual R is multiplied by M, which grows without bound at each known solution u_i. Newton's step
-for M R is a multiple of that for R, so it needs neither another matrix nor another solve (P. E. Farrell, A. Birkisson,
-S. W. Funke, SIAM Journal on Scientific Computing 37, 2015, A2026):
-
-    M(u) = prod_i (|u - u_i|^-p + sigma),    du = tau d,    K d = -R,    tau = 1/(1 - d . grad M/M)
-
 **Release.** R(u) + t b = 0 with -b . u = q, first that of the guess; then the path is followed by arc length, through
 folds, until the force t is zero: there is an equilibrium.
 
@@ -18,7 +12,7 @@ flow K0 du/dt = -R, of length 1/s. Sharp folds relax, while soft directions stay
 energy, so its fixed points are stable equilibria.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -26,32 +20,23 @@ import numpy as np
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.bifurcation import largest
-from magshell_fenicsx.continuation.control import Bordered, GivenConjugate, Metric, Row, plus
+from magshell_fenicsx.continuation.control import GivenConjugate
+from magshell_fenicsx.continuation.deflated import deflated
+from magshell_fenicsx.continuation.device import FORCE, HeldAlong
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import (
-    Amplitudes,
     State,
     System,
-    Tangent,
     Vector,
-    Weighted,
     dot,
     max_abs,
     symmetric_part,
 )
 
-POWER, SHIFT = 2.0, 1.0  # p and sigma
-MOST_ITERATIONS = 40
-CLOSE = 1e-3  # in lengths of the system: after a shorter step Newton's method itself goes on
-NEAR_ONE = 2.0  # there the deflation must change the step by less than this factor
-BENT = 0.5  # part of a step that the linear model may leave unexplained
-LEAST = 1e-3  # where a shorter part of a step would be needed, a singular tangent is near
-LEAP, MOST_LEAPS = 1.0, 4  # in lengths of the system: a step over it
-FORCE = "holding force"
 FIRST, LONGEST, SHORTEST = 0.02, 1000.0, 1e-3  # steps: the first in the metric's length, others over the first
 MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
 MOST_BRACKETS, LITTLE = 4, 1e-2  # solves for the zero of the force; this part of its change counts as zero
@@ -63,109 +48,9 @@ RESTED = 0.05  # in lengths of the system: a shorter step with so small a shift 
 SMALL = 0.01
 COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
 MODE, DOWN = 1.0, 0.3  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
+MOST_CHANGED = 10  # times that a solution gets stiffer penalties or new cuts
 DESCENTS = 20  # times that a guess goes on settling
 OVER = "the time of the search is over"
-
-
-@dataclass(frozen=True)
-class Deflation:
-    """The operator M of some known solutions; |.| is the root mean square over the system's length."""
-
-    metric: Metric
-    known: Sequence[Vector]
-
-    def value(self, u: Vector) -> float:
-        """M at u."""
-        sizes = (self.metric.norm(u - v, 0.0) for v in self.known)
-        return float(np.prod([size**-POWER + SHIFT if size else np.inf for size in sizes]))
-
-    def slope(self, u: Vector, d: Vector) -> float:
-        """d . grad M/M at u."""
-        total = 0.0
-        for v in self.known:
-            away = (u - v, 0.0)
-            size = self.metric.norm(*away)
-            total -= (
-                POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
-            )
-        return total
-
-    def factor(self, u: Vector, d: Vector) -> float:
-        """tau for Newton's step d at u; zero at a known solution."""
-        rest = 1 - self.slope(u, d)
-        return 1 / rest if rest else np.inf
-
-
-def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: Sequence[Vector] = ()) -> State | None:
-    """A state near a solution that is not known and on which a row holds; None if none is found.
-
-    Steps are shortened until the residual changes as the tangent says. Newton's method must confirm the result.
-
-    Parameters
-    ----------
-    name
-        The amplitude that the row determines.
-    known
-        The displacements of the known solutions.
-    """
-    system, state, part, leaps = newton.system, guess, 1.0, 0
-    deflation = Deflation(Metric(system, 1.0), known)
-    residual = system.residual(state.u, state.mu), row.residual(state)
-    for _ in range(MOST_ITERATIONS):
-        matrix = Bordered(system, newton.factor_at(state), state, name, row)
-        d = matrix.solve(-residual[0], -residual[1])
-        tau, size, M = deflation.factor(state.u, d[0]), matrix.size(d), deflation.value(state.u)
-        if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
-            return None
-        if size <= CLOSE and 1 / NEAR_ONE < tau < NEAR_ONE:
-            return state.with_(state.u + d[0], name, state.mu[name] + d[1])
-        part, bent = min(1.0, 4 * part), np.inf
-        while not bent <= BENT:
-            leaps += (leap := part < LEAST)
-            if leaps > MOST_LEAPS:
-                return None
-            part = LEAP / (abs(tau) * size) if leap else part
-            ahead = state.with_(state.u + part * tau * d[0], name, state.mu[name] + part * tau * d[1])
-            residual = system.residual(ahead.u, ahead.mu), row.residual(ahead)
-            left = matrix.solve(-residual[0], -residual[1])
-            left = plus(left, tau * deflation.slope(state.u, left[0]), d)  # the next step with the same matrix, over M
-            ratio = deflation.value(ahead.u) / M
-            rest = ratio * left[0] + (part - 1) * tau * d[0], ratio * left[1] + (part - 1) * tau * d[1]
-            bent = np.sqrt(matrix.inner(rest, rest) / matrix.inner(d, d)) / abs(part * tau)
-            if leap:
-                break
-            if not bent <= BENT:
-                part *= float(np.clip(0.8 * BENT / bent, 0.1, 0.5)) if np.isfinite(bent) else 0.1
-        part, state = min(part, 1.0), ahead
-    return None
-
-
-class Held:
-    """A system with one more amplitude, a force along b."""
-
-    def __init__(self, system: System, b: Vector) -> None:
-        self.comm, self.size, self.length, self.coordinates = (
-            system.comm,
-            system.size,
-            system.length,
-            system.coordinates,
-        )
-        self._system, self._b = system, b
-
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._system.residual(u, mu) + mu[FORCE] * self._b
-
-    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        return self._b if name == FORCE else self._system.load(u, mu, name)
-
-    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        return dot(self.comm, self._b, u) if name == FORCE else self._system.potential(u, mu, name)
-
-    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        return 0.0 if FORCE in (name, other) else self._system.curvature(u, mu, name, other)
-
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
-        return self._system.tangent(u, mu, stress)
 
 
 def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]:
@@ -176,7 +61,7 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     system = newton.system
     residual, size = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
     b = np.asarray(b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0))  # a force of order one
-    holder = newton.on(Held(system, b))
+    holder = newton.on(HeldAlong(system, b))
     first = -dot(system.comm, b, residual) / dot(system.comm, b, b)
     row = GivenConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
     near = deflated(holder, State(guess.u, {**guess.mu, FORCE: first}), FORCE, row)
@@ -221,14 +106,17 @@ class Settling:
     ----------
     unloaded
         A state with a positive definite tangent K0.
+    passes
+        Whether a step must not be gone, as shells would pass through each other.
     """
 
     system: System
     unloaded: State
+    passes: Callable[[State, State], bool] = lambda here, ahead: False
 
     def __post_init__(self) -> None:
         K = symmetric_part(self.system.tangent(self.unloaded.u, self.unloaded.mu))
-        self._K0, self._shifted = K.copy(), K.copy()
+        self._K0 = K.copy()
         self._stiff, self._factors = Factorisation(self.system.comm), Factorisation(self.system.comm)
         self._stiff.factor(self._K0)
 
@@ -240,16 +128,16 @@ class Settling:
             K = symmetric_part(system.tangent(u, guess.mu)).copy()
             while spent < MOST_FACTORS:
                 spent += 1
-                K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                self._shifted.axpy(shift, self._K0, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-                self._factors.factor(self._shifted)
+                shifted = K.copy()
+                shifted.axpy(shift, self._K0, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)  # K has what touches too
+                self._factors.factor(shifted)
                 if self._factors.negative_pivots:
                     shift *= 2
                     continue
                 du = -self._factors.solve(residual)
                 ahead = system.residual(u + du, guess.mu)
                 left = self._size(ahead + shift * self._stiff.times(du)) / self._size(residual)
-                if left <= UNEXPLAINED:
+                if left <= UNEXPLAINED and not self.passes(State(u, guess.mu), State(u + du, guess.mu)):
                     u, residual = u + du, ahead
                     ends = shift < SMALL and max_abs(system.comm, du) <= RESTED * system.length
                     shift /= 4 if left < EASY else 1
@@ -281,11 +169,35 @@ class Limits:
     over: Callable[[], bool] = lambda: False
 
 
-class Guess:
-    """A guess, made when it is needed, and the direction in which it is away from a known solution."""
+@dataclass(frozen=True)
+class Rules:
+    """What solutions of shells that may touch have to keep.
 
-    def __init__(self, make: Callable[[], State], base: State, displacement: Callable[[Vector], Vector]) -> None:
-        self._make, self._base, self._displacement = make, base, displacement
+    Attributes
+    ----------
+    passes
+        Whether shells pass through each other on the straight way between two states.
+    own
+        A solution with penalties and cuts of its own, to be solved again; None if it has them.
+    """
+
+    passes: Callable[[State, State], bool] = lambda here, there: False
+    own: Callable[[State], State | None] = lambda state: None
+
+
+class Guess:
+    """A guess, made when it is needed, and the direction in which it is away from a known solution.
+
+    Attributes
+    ----------
+    reached
+        Whether a way without shells that pass through each other leads there.
+    """
+
+    def __init__(
+        self, make: Callable[[], State], base: State, displacement: Callable[[Vector], Vector], *, reached: bool
+    ) -> None:
+        self._make, self._base, self._displacement, self.reached = make, base, displacement, reached
 
     @cached_property
     def state(self) -> State:
@@ -303,6 +215,7 @@ def further(
     limits: Limits,
     displacement: Callable[[Vector], Vector] = lambda u: u,
     descend: Callable[[State], State] | None = None,
+    rules: Rules | None = None,
 ) -> Iterator[Point]:
     """Solutions at the amplitudes of a known one, each accepted as a point of the path is.
 
@@ -313,14 +226,16 @@ def further(
     start
         A solution.
     guesses
-        Further guesses, which are tried first.
+        Further guesses, which are tried first; ways lead there on which no shells pass through each other.
     displacement
         A vector of the system with zeros for unknowns that are no displacements.
     descend
         Lets a state go down in energy by some steps; then only stable solutions count. None: all count.
+    rules
+        Of shells that may touch.
     """
-    search = _Search(path, [start], descend, limits.over)
-    queue = [Guess(make, start, displacement) for make in guesses]
+    search = _Search(path, [start], descend, limits.over, rules or Rules())
+    queue = [Guess(make, start, displacement, reached=True) for make in guesses]
     queue += search.along_mode(start, displacement)
     accepted = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
@@ -331,7 +246,7 @@ def further(
             point = path.recorded(partial(_unless, limits.over, attempt, guess))
             if point == OVER:
                 return
-            if isinstance(point, str):
+            if isinstance(point, str) or isinstance(point := search.kept(guess, point), str):
                 continue
             search.known.append(point.state)
             queue += search.along_mode(point.state, displacement)
@@ -362,13 +277,40 @@ class _Search:
     """
 
     def __init__(
-        self, path: Path, known: list[State], descend: Callable[[State], State] | None, over: Callable[[], bool]
+        self,
+        path: Path,
+        known: list[State],
+        descend: Callable[[State], State] | None,
+        over: Callable[[], bool],
+        rules: Rules,
     ) -> None:
-        self._path, self.known, self._descend, self._over = path, known, descend, over
+        self._path, self.known, self._descend, self._over, self._rules = path, known, descend, over, rules
         self._system, self._newton = path.system, path.newton
         self._solver = Path(path.newton, path.name, "load", path.options)  # without a journal
         self._value = known[0].mu[path.name]
         self._row = path.given("load", self._value)
+
+    def kept(self, guess: Guess, point: Point) -> Point | str:
+        """A solution as the rules ask for it, or why it is none: every known one is reached without passing through."""
+        for _ in range(MOST_CHANGED):
+            if (own := self._rules.own(point.state)) is None:
+                break
+            again = self._path.recorded(partial(self._again, own))
+            if isinstance(again, str):
+                return again
+            point = again
+        else:
+            return "the shells that touch have no cuts and penalties that last"
+        if self._is_known(point.state):
+            return "the solution is a known one"
+        begins = [*self.known, *([guess.state] if guess.reached else [])]
+        if all(self._rules.passes(begin, point.state) for begin in begins):
+            return "shells have passed through each other"
+        return point
+
+    def _again(self, state: State) -> Point | str:
+        point = self._solver.solve(self._row, self._value, state)
+        return point if isinstance(point, str) else self._solver.exact(point, point)
 
     def by_newton(self, guess: Guess) -> Point | str:
         """The solution that deflated Newton's method finds from a guess."""
@@ -408,7 +350,7 @@ class _Search:
     def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:
         """Guesses on both sides of a solution along its softest mode."""
         mode = _Mode(self._path, state)
-        return [Guess(partial(mode.state, size), state, displacement) for size in (MODE, -MODE)]
+        return [Guess(partial(mode.state, size), state, displacement, reached=False) for size in (MODE, -MODE)]
 
     def _accepted(self, guess: State) -> Point | str:
         path = self._path

@@ -15,6 +15,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, branching, find_bifurcation
+from magshell_fenicsx.continuation.fold import held_along
 from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
@@ -30,11 +31,14 @@ from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
+from magshell_fenicsx.simulate.touch import of_its_own, passes, with_cuts_here
+from magshell_fenicsx.simulate.transfer import nodes_of_shells
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, branch
 
 Array = NDArray[np.float64]
 WAVES = "m = "
 NEAREST = 24  # nodes through which a cubic polynomial runs
+MOST_CHANGED = 10  # times that a carried state gets stiffer penalties or new cuts
 FIRST = 0.1  # step of a branch by arc length
 TINY = 1e-300
 
@@ -110,7 +114,8 @@ def departed(stage: Stage, bifurcation: Record, scale: float) -> Departure:
     u, phi = _carried(stage.scene, new, bifurcation, mode)
     mu = {**new.unloaded().mu, **bifurcation.point.state.mu}
     path = _by_arc(other, bifurcation.amplitude, scale)
-    located = path.recorded(partial(_located, other, path, State(u, mu), phi))
+    guess = _settled(other, path, State(u, mu), phi)
+    located = guess if isinstance(guess, str) else path.recorded(partial(_located, other, path, guess, phi))
     if isinstance(located, str):
         raise Stopped(f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: {located}")
     departure = Departure(other, path, located, unstable=bifurcation.excluded_pivots)
@@ -159,7 +164,7 @@ def leaving(stage: Stage, bifurcation: Record, goal: Goal, scale: float, number:
     """
     departure = departed(stage, bifurcation, scale)
     yield departure.record(number)
-    crossing = branching(departure.path, departure.point)
+    crossing = branching(departure.path, departure.point, partial(passes, departure.stage))
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
     comm, u, phi = departure.scene.model.system.comm, departure.point.state.u, departure.point.du
@@ -181,6 +186,32 @@ def _at(path: Path, state: State, phi: Vector, unstable: int, error: float = 0.0
     comm = path.system.comm
     along = np.asarray(phi * path.system.length / max_abs(comm, phi))
     return Point(state, 0.0, along, 0.0, unstable, unstable, error=error, load_error=load_error)
+
+
+def _settled(stage: Stage, path: Path, guess: State, phi: Vector) -> State | str:
+    """A carried state of shells that touch, at rest but for a force along the mode, with contact of the model's own:
+    cuts there, and penalties that hold its nodes apart. Without contact the guess itself."""
+    scene = stage.scene
+    if not scene.model.touchings:
+        return guess
+    state, mode = with_cuts_here(scene, guess), stage.padded(phi)
+    for _ in range(MOST_CHANGED):
+        point = path.recorded(partial(_at_rest, stage, path, state, mode))
+        if isinstance(point, str):
+            return point
+        state = stage.leave(point.state)
+        if (own := of_its_own(scene, state)) is None:
+            return state
+        state = own
+    return "the shells that touch have no cuts and penalties that last"
+
+
+def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
+    try:
+        held = held_along(stage.newton, stage.enter(guess), mode)
+    except np.linalg.LinAlgError:
+        held = None
+    return _at(path, held[0], mode, 0) if held else "shells that touch do not come to rest there; take a finer mesh"
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
@@ -281,13 +312,18 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     assert isinstance(mirror, Mirror)
     parts = [old.model.r0.x.array[:size], u[:size], mode[:size]]
     places, *fields = (np.concatenate(comm.allgather(part.reshape(-1, 3))) for part in parts)
+    owners = [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(old)]
     off = mirror.beyond(places) > 1e-9
     S = mirror.reflection
     x = np.concatenate([places, mirror.image(places[off])])
     both = [np.concatenate([f, sign * f[off] @ S]) for f, sign in zip(fields, (1.0, -1.0), strict=True)]
     Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T  # from the new frame to the old one
     wanted = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
-    at_nodes = through(x, np.hstack(both), wanted)
+    values, at_nodes = np.hstack(both), np.zeros((len(wanted), 6))
+    for inside, own in zip(owners, nodes_of_shells(new), strict=True):  # shells that touch are near each other
+        if own.any():
+            from_own = np.concatenate([inside, inside[off]])
+            at_nodes[own] = through(x[from_own], values[from_own], wanted[own])
     return at_nodes[:, :3] @ Q, at_nodes[:, 3:] @ Q
 
 

@@ -7,7 +7,7 @@ wide as the boundary layer of a sphere, sqrt(2 h H) for a dent of depth H.
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.search import Limits, Settling, further
+from magshell_fenicsx.continuation.search import Limits, Rules, Settling, further
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.course import SearchSection
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -24,6 +24,8 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, plain, staged
 from magshell_fenicsx.simulate.steps import held_by
+from magshell_fenicsx.simulate.touch import before_passing, of_its_own, passes
+from magshell_fenicsx.simulate.transfer import nodes_of_shells
 
 Array = NDArray[np.float64]
 DEPTHS = 0.9, 0.03, 0.8, 0.2  # of the dents, over the height of the shell above its supports
@@ -35,39 +37,76 @@ THIN = 1e-6  # a smaller mean square distance from a plane or a line, over the l
 
 
 def dented(scene: Scene, state: State) -> Iterator[State]:
-    """Dented copies of a state, none of a flat shell; collective."""
-    system, comm, h = scene.model.system, scene.model.system.comm, scene.problem.material.h
+    """Dented copies of a state, none of flat shells; of several shells each alone, then all. Collective."""
+    system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
-    normal, level = _plane(scene, x)
-    height = x @ normal - level
-    top = float(comm.allreduce(float(height.max(initial=0.0)), MPI.MAX))
-    bottom = float(comm.allreduce(float(height.min(initial=0.0)), MPI.MIN))
-    if -bottom > top:  # it hangs down
-        height, normal, top = -height, -normal, -bottom
-    for depth in DEPTHS if top > LEAST * h else ():
-        width = WIDTH * np.sqrt(2 * h * depth * top)
-        above = height - max((1 - depth) * top, min(CLEAR * width, top / 2))
-        dent = -2 * width * np.logaddexp(0.0, above / width)
-        yield State(state.u + system.held(np.outer(dent, normal).ravel()), dict(state.mu))
+    parts = [Curved.of(scene, x, inside) for inside in nodes_of_shells(scene)]
+    curved = [part for part in parts if part.top > LEAST * scene.problem.material.h]
+    for depth in DEPTHS:
+        dents = [part.dent(depth, scene.problem.material.h) for part in curved]
+        for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
+            yield State(state.u + system.held(dent.ravel()), dict(state.mu))
 
 
-def _plane(scene: Scene, x: Array) -> tuple[Array, float]:
+@dataclass(frozen=True)
+class Curved:
+    """A shell above the plane of its supports.
+
+    Attributes
+    ----------
+    inside
+        (n,) which nodes are its own.
+    height
+        (n,) along the normal.
+    top
+        The largest height.
+    """
+
+    inside: NDArray[np.bool_]
+    normal: Array
+    height: Array
+    top: float
+
+    @classmethod
+    def of(cls, scene: Scene, x: Array, inside: NDArray[np.bool_]) -> "Curved":
+        """Of places (n, 2 or 3) of this rank's nodes; collective."""
+        comm = scene.model.system.comm
+        normal, level = _plane(scene, x, inside)
+        height = x @ normal - level
+        top = float(comm.allreduce(float(height[inside].max(initial=0.0)), MPI.MAX))
+        bottom = float(comm.allreduce(float(height[inside].min(initial=0.0)), MPI.MIN))
+        if -bottom > top:  # it hangs down
+            return cls(inside, -normal, -height, -bottom)
+        return cls(inside, normal, height, top)
+
+    def dent(self, depth: float, h: float) -> Array:
+        """The displacement (n, 2 or 3) of a dent of this part of its height; h is the thickness."""
+        width = WIDTH * np.sqrt(2 * h * depth * self.top)
+        above = self.height - max((1 - depth) * self.top, min(CLEAR * width, self.top / 2))
+        dent = np.where(self.inside, -2 * width * np.logaddexp(0.0, above / width), 0.0)
+        return np.outer(dent, self.normal)
+
+
+def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, float]:
     """The unit normal of the plane of the supports and its height along it; the best plane of a shell without any.
 
     Parameters
     ----------
     x
         Places (n, 2 or 3) of this rank's nodes.
+    inside
+        (n,) which are the shell's own.
     """
     held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
         held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
+    held &= inside
     if scene.model.axisymmetric:
         return np.array([0.0, 1.0]), float(x[held, 1].mean()) if held.any() else 0.0
     level, spread = _moments(scene, x[held])
     size, axes = np.linalg.eigh(spread)
     if size[1] <= THIN * size[2]:  # on one line: the plane through it that is nearest to the shell
-        _, spread = _moments(scene, x)
+        _, spread = _moments(scene, x[inside])
         along = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
         across = np.eye(3) - along
         size, axes = np.linalg.eigh(across @ spread @ across + along * np.trace(spread))
@@ -149,10 +188,22 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     limits = Limits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
     descend = dents.descended if search.stable else None
-    for number, solution in enumerate(further(path, stage.enter(state), made, limits, stage.displaced, descend), 1):
+    found = further(path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage))
+    for number, solution in enumerate(found, 1):
         point = stage.point(solution)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
+
+
+def _rules(stage: Stage) -> Rules:
+    """What solutions have to keep: penalties and cuts of their own, within the bound, and no shell through another."""
+    scene = stage.scene
+
+    def own(state: State) -> State | None:
+        changed = of_its_own(scene, stage.leave(state))
+        return State(state.u, {**state.mu, **changed.mu}) if changed else None
+
+    return Rules(partial(passes, stage), own) if scene.model.touchings else Rules()
 
 
 class _Dents:
@@ -165,10 +216,13 @@ class _Dents:
 
     @cached_property
     def _settling(self) -> Settling:
-        return Settling(self._stage.scene.model.system, self._stage.scene.unloaded())
+        scene = self._stage.scene
+        return Settling(scene.model.system, scene.unloaded(), partial(passes, plain(scene)))
 
     def settled(self, number: int) -> State:
-        return self._stage.enter(self._settling.settled(self._guesses[number]))
+        """One that has come there without shells that pass through each other."""
+        guess = before_passing(plain(self._stage.scene), self._state, self._guesses[number])
+        return self._stage.enter(self._settling.settled(guess))
 
     def descended(self, state: State) -> State:
         """A state of the stage further down in energy; amplitudes whose conjugates are held stay."""

@@ -11,6 +11,7 @@ step.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import degrees
 from typing import Any, TypeAlias
 
@@ -34,6 +35,7 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import ground_of
 from magshell_fenicsx.shells.terms import EnergyFactory
+from magshell_fenicsx.simulate.numbers import number_of, scene_with, size_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, plain
@@ -94,7 +96,7 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
     columns |= {name: stage.padded(column) for name, column in (by_patch | _field_column(scene, state)).items()}
     by_column = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return by_column | to_imperfections(stage, fold)
+    return by_column | to_imperfections(stage, fold) | to_shells(stage, fold)
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
@@ -133,6 +135,8 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
     within, one = scene.problem.within, np.ones(3)
+    if field.patches and scene.problem.context.sections.get("shells"):
+        return _of_shells(scene, fold.state, field, field.patches)
     if not within:
         return {"remanence": _magnetic_column(scene, fold.state, field)}
 
@@ -145,6 +149,23 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         f"remanence {patch}": _magnetic_column(scene, fold.state, replace(field, remanent=remanence))
         for patch, remanence in alone.items()
     }
+
+
+def _of_shells(
+    scene: Scene, state: State, field: Magnetisation, patches: Mapping[str, Array | Pattern]
+) -> dict[str, Vector]:
+    """That of each of several shells."""
+    model = scene.model
+    own: Mapping[str, NDArray[np.bool_]]
+    if model.midsurface:
+        cells = model.midsurface.mesh.topology.index_map(2)
+        own, count = model.midsurface.patches, cells.size_local + cells.num_ghosts
+    else:
+        assert model.axisymmetric
+        own, count = model.meridian.patches, len(model.meridian.order)
+    none = dict.fromkeys(patches, np.zeros(3))
+    alone = {name: replace(field, patches={**none, name: of}).on(own, count) for name, of in patches.items()}
+    return {f"remanence {name}": _magnetic_column(scene, state, each) for name, each in alone.items()}
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
@@ -209,7 +230,7 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
 
 
 def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
-    scene, size = stage.scene, stage.scene.model.system.size
+    scene = stage.scene
     if scene.problem.axisymmetric and name.startswith("at."):
         return 0.0
     problem = scene.problem
@@ -218,12 +239,7 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     further, back = (_deviation(scene, changed(problem.imperfections, key, name, c), key) for c in (tiny, -tiny))
 
     def out_of_balance(change: float) -> float:
-        other = reshaped(scene, Along(further, back, change / (2 * tiny)))
-        assert same_mesh(scene, other)
-        vectors = (fold.state.u, fold.left)
-        u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
-        moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
-        return sensitivity(system, moved, system.residual(u, fold.state.mu))
+        return _in_other(stage, fold, reshaped(scene, Along(further, back, change / (2 * tiny))))
 
     grown = [
         fold.state.mu[of]
@@ -231,6 +247,56 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
         if key in keys
     ]
     return (grown or [1.0])[0] * (out_of_balance(step) - out_of_balance(-step)) / (2 * step)
+
+
+def _in_other(stage: Stage, fold: Fold, other: Scene) -> float:
+    """-(left . R)/(left . R_mu) of the same state in a scene with a slightly different shell on the same mesh.
+
+    What touches there is what touches in the state, see `expand`.
+    """
+    scene, size = stage.scene, stage.scene.model.system.size
+    assert same_mesh(scene, other)
+    u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in (fold.state.u, fold.left))
+    expand(scene, other, stage.leave(fold.state))
+    moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
+    return sensitivity(system, moved, system.residual(u, fold.state.mu))
+
+
+def expand(scene: Scene, other: Scene, state: State) -> None:
+    """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
+    touch_as_in(scene, other, state)
+    at = scene.model.system.at(state)
+    for name, (pressing, _) in scene.model.contacts.items():
+        other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
+
+
+def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
+    """Take contact between shells in another scene on the same mesh as polynomials about a state of the first one."""
+    at = scene.model.system.at(state)
+    of_one: Sequence[Any] = scene.model.touchings
+    of_other: Sequence[Any] = other.model.touchings
+    for touching, same in zip(of_one, of_other, strict=True):
+        same.expand_about(at.of(touching.pressed))
+
+
+def to_shells(stage: Stage, fold: Fold) -> dict[str, float]:
+    """Derivatives by the numbers of imperfections of several shells, each by its key; collective."""
+    context, found = stage.scene.problem.context, dict[str, float]()
+    for name, member in (context.sections.get("shells") or {}).items():
+        for i, section in enumerate(member.shell.imperfections):
+            for number in section.parameters:
+                key = f"shells.{name}.shell.imperfections.{i}.{number}"
+                if not number.startswith("at."):
+                    found[key] = _by_number(stage, fold, key)
+    return found
+
+
+def _by_number(stage: Stage, fold: Fold, key: str) -> float:
+    """The derivative by a number of the case, as a central difference of the residual."""
+    scene, context = stage.scene, stage.scene.problem.context
+    value, step = number_of(context, key), STEP * size_of(context, key)
+    ahead, back = (_in_other(stage, fold, scene_with(scene, key, value + change)) for change in (step, -step))
+    return (ahead - back) / (2 * step)
 
 
 def _unit(problem: Problem, key: str, name: str) -> float:

@@ -29,6 +29,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+PASSED = 8  # halvings of a way on which shells would pass through each other
 HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
 AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
@@ -109,13 +110,32 @@ def recut(stage: Stage, low: Point, high: Point) -> State | None:
 
     None if these would not be much better.
     """
-    touchings = [each for each in stage.scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
-    if not touchings:
-        return None
-    at = stage.scene.model.system.at(stage.leave(high.state))
-    numbers = {each.pair.cuts: at.of(each.recut) for each in touchings}
-    changed = {name: number for name, number in numbers.items() if number is not None}
+    changed = better_cuts(stage.scene, stage.leave(high.state))
     return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+
+def better_cuts(scene: Scene, state: State) -> dict[str, float]:
+    """The numbers of cuts at a state that are much better than those it has; collective."""
+    at = scene.model.system.at(state)
+    numbers = {each.pair.cuts: at.of(each.recut) for each in _with_cuts(scene)}
+    return {name: number for name, number in numbers.items() if number is not None}
+
+
+def with_cuts_here(scene: Scene, state: State) -> State:
+    """A state, as one that another model gives, with the cuts of shells at its own displacement; collective."""
+    at = scene.model.system.at(state)
+    return State(state.u, {**state.mu, **{each.pair.cuts: at.of(each.numbered) for each in _with_cuts(scene)}})
+
+
+def _with_cuts(scene: Scene) -> list[Touching]:
+    return [each for each in scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
+
+
+def of_its_own(scene: Scene, state: State) -> State | None:
+    """A state with penalties that are stiffer where shells or bodies are too deep in each other, and with cuts of its
+    own; None if it needs none of these. Collective."""
+    changed = {**stiffnesses(scene, state), **better_cuts(scene, state)} if scene.model.touchings else {}
+    return State(state.u, {**state.mu, **changed}) if changed else None
 
 
 def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
@@ -161,6 +181,16 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     _refuse_through(touchings, whole)
 
 
+def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
+    """Whether a shell passes through another one, itself or a mirror plane on the straight way between two points."""
+    ends = (end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0) for end in (low, high))
+    try:
+        refuse_passing(stage, *ends)
+    except (StepTooLong, PathStopped):
+        return True
+    return False
+
+
 def _refuse_through(
     touchings: Sequence[Touching] | Sequence[MeridianTouching], ends: Sequence[NDArray[np.float64]]
 ) -> None:
@@ -184,6 +214,18 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
             ends.append((model.system.at(state).of(partial(getattr, field, "places")), state.mu))
         if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
+
+
+def before_passing(stage: Stage, low: State, high: State) -> State:
+    """The second of two states of a stage, or one on the straight way to it, before shells pass through each other."""
+    if not stage.scene.model.touchings or not passes(stage, low, high):
+        return high
+    part, beyond, way = 0.0, 1.0, high.u - low.u
+    for _ in range(PASSED):
+        middle = (part + beyond) / 2
+        through = passes(stage, low, State(low.u + middle * way, high.mu))
+        part, beyond = (part, middle) if through else (middle, beyond)
+    return State(low.u + part * way, high.mu)
 
 
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:

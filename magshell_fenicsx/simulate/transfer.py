@@ -146,6 +146,20 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 
 
+def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
+    """Which of this rank's nodes are of each shell, one for all of a shell alone."""
+    model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
+    count = model.system.size // model.V.dofmap.bs
+    if len(names) < 2:
+        return [np.ones(count, dtype=bool)]
+    patches = model.meridian.patches if model.axisymmetric else model.midsurface.patches if model.midsurface else {}
+    found = list[NDArray[np.bool_]]()
+    for name in names:
+        nodes = model.V.dofmap.list[np.flatnonzero(patches[name])].ravel()
+        found.append(np.isin(np.arange(count), nodes))
+    return found
+
+
 def _all_nodes(scene: Scene) -> Array:
     """The nodes of all ranks in the chart."""
     return np.concatenate(scene.model.system.comm.allgather(chart(scene)))

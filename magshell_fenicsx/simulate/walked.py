@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -16,9 +17,18 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
-from magshell_fenicsx.simulate.touch import recut, refuse_crossing, refuse_passing, refuse_return, stiffer
+from magshell_fenicsx.simulate.touch import (
+    of_its_own,
+    passes,
+    recut,
+    refuse_crossing,
+    refuse_passing,
+    refuse_return,
+    stiffer,
+)
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
+MOST_CHANGED = 10  # times that a first point gets stiffer penalties or new cuts
 ASKED = 1 / 16  # of the first step: where load control fails in so short a step, a fold is looked for first
 
 
@@ -106,7 +116,7 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 if excluded and goal.until == "limit":
                     furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
                 if label == "bifurcation":
-                    crossing_at_point = branching(_by_arc(stage, path), point)
+                    crossing_at_point = branching(_by_arc(stage, path), point, partial(passes, stage))
                     crossing = crossing or crossing_at_point
                     mode = ("symmetric" if crossing_at_point.symmetric else "asymmetric") if crossing_at_point else ""
                 if label == "fold":
@@ -211,6 +221,13 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
     Stopped
         If the branch is lost.
     """
+    try:
+        for _ in range(MOST_CHANGED):
+            if not (own := of_its_own(stage.scene, stage.leave(start.state))):
+                break
+            start = path.renewed(start, State(start.state.u, {**start.state.mu, **own.mu}))
+    except PathStopped as e:
+        raise Stopped(f"no first point of the branch with contact of its own: {e}") from None
     walk, watch, lost = _walk(stage, path, start, goal), stage.scene.watch, ""
     watch.begin(path, start, stage.leave, look=True)
     yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.continuation.control import GivenLoad, Metric
+from magshell_fenicsx.continuation.deflated import POWER, SHIFT, Deflation, deflated
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.search import OVER, POWER, SHIFT, Deflation, Limits, Settling, deflated, further
+from magshell_fenicsx.continuation.search import OVER, Limits, Settling, further
 from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector
 from tests.continuation.toys import Toy, pitchfork, snap_back, snap_through
 

@@ -124,9 +124,9 @@ class Faces:
 
     def change(self, u: Array, w: Array) -> Array:
         """What H (nodes,) changes by along w (nodes, 3)."""
-        return np.asarray(
-            self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel() if not self.constant else 0 * u[:, 0]
-        )
+        if self.constant:
+            return 0 * u[:, 0]
+        return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel())
 
     def ratio(self, u: Array) -> tuple[Array, Array]:
         """The volumes and areas (nodes,) whose ratio is H."""

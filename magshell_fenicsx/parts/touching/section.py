@@ -162,12 +162,6 @@ def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
     if step.load.multiplies(step, context):
         said = f"{step.key}.kind: {step.kind}"
         raise ValueError(f"{said}: with contact, undeformed gaps would change: take steps along a path")
-    if getattr(step.load, "search", None):
-        raise ValueError(f"{step.key}.search: with contact between shells it is not built: leave it out")
-    if getattr(step.load, "then", None) == "follow":
-        raise ValueError(f"{step.key}.then: follow: with contact between shells it is not built: leave it out")
-    if getattr(step.load, "sensitivities", False):
-        raise ValueError(f"{step.key}.sensitivities: with contact between shells it is not built: leave it out")
 
 
 def account(context: Context, loads: "Loads") -> Account:

@@ -347,8 +347,6 @@ class Touching:
         point, k = at.point[joined.first], self.stiffness.value
         return Along.of(len(self._points.weight), point, self._h - joined.distance, moves, k, SOFT * self._h)
 
-    # its history
-
     def recut(self) -> float | None:
         """The number of the present displacement, if cuts there are better than those of the state; collective.
 
@@ -367,6 +365,10 @@ class Touching:
         places = self._facing.found(u, self._h, points)
         counted = places.of(~self._facing.left_to_edges(points, places, normals))
         return self._cuts.numbered(u) if self._astray(points, counted) < astray / 2 else None
+
+    def numbered(self) -> float:
+        """The number of the present displacement, for cuts there; collective."""
+        return self._cuts.numbered(self._now())
 
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
         """The part of the force at points that do not face what they faced, or on what is `turned`."""

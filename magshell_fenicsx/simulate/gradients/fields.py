@@ -33,7 +33,7 @@ from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import magnetic_terms
+from magshell_fenicsx.simulate.sensitivity import magnetic_terms, touch_as_in
 from magshell_fenicsx.simulate.transfer import transfer
 
 if TYPE_CHECKING:  # one of them is built
@@ -123,15 +123,6 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     return FieldGradient(f, forces, places, normals)
-
-
-def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
-    """Take contact between shells in another scene on the same mesh as polynomials about a state of the first one."""
-    at = scene.model.system.at(state)
-    of_one: Sequence[Any] = scene.model.touchings
-    of_other: Sequence[Any] = other.model.touchings
-    for touching, same in zip(of_one, of_other, strict=True):
-        same.expand_about(at.of(touching.pressed))
 
 
 def _known(term: KnowsFields, place: Place, w: fem.Function, name: str) -> tuple[fem.Function, Array] | None:

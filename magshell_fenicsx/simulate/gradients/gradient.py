@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
@@ -15,13 +15,14 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, adjoint_of_instability, along, by_load
-from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field, touch_as_in
+from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, size_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import expand
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
@@ -64,7 +65,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
             state = other.model.system.placed(state)
             if other is not scene:
-                _expand(scene, other, place.state)
+                expand(scene, other, place.state)
             total += _at(scene, other, place, state) + (
                 0.0 if adjoint.by_itself and place is first else _own(other, place, state)
             )
@@ -113,14 +114,6 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     problem = adjoint.scene.problem
     value, size = number_of(problem.context, key), size_of(problem.context, key)
     return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value, size)
-
-
-def _expand(scene: Scene, other: Scene, state: State) -> None:
-    """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
-    touch_as_in(scene, other, state)
-    at = scene.model.system.at(state)
-    for name, (pressing, _) in scene.model.contacts.items():
-        other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
 
 
 def _moved(scene: Scene, other: Scene, state: State) -> State:
