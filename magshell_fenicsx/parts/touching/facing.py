@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
+    BETWEEN,
     BULGE,
-    LATTICES,
     SIGNS,
     WAYS,
     Cells,
@@ -23,14 +23,13 @@ from magshell_fenicsx.parts.touching.nearest import (
     Places,
     jets,
     near_pairs,
-    project,
+    places_near,
 )
 from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
 MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
-BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
 MANY = 2_000_000  # distances of a point from a place at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
@@ -97,16 +96,6 @@ class Facing:
         centres = nodal.mean(axis=1)
         return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
 
-    def _slabs(self, r: Array, cell: Longs) -> tuple[Array, Array, Array]:
-        """Planes through the middle of cells, with their normals, and how far the cells are from these at most."""
-        nodal, corners = r[self._cells.nodes[cell]], self._cells.at_corners @ r[self._cells.nodes[cell]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-        height = np.einsum("nki,ni->nk", nodal - corners[:, :1], normal)
-        low, high = height.min(axis=1), height.max(axis=1)
-        middle = corners[:, 0] + ((low + high) / 2)[:, None] * normal
-        return np.asarray(middle), np.asarray(normal), np.asarray(self._cells.overshoot * (high - low) / 2)
-
     def _fit(self, i: Longs, j: Longs, far: float = 0.0, *displaced: Array) -> tuple[Longs, Longs]:
         """The pairs of cells that may touch; of those beside each other where one of some surfaces is folded."""
         allowed = self._allowed(i, j)
@@ -171,38 +160,12 @@ class Facing:
         cells = self._cells
         order, cell_of = points.by_cell
         first = np.searchsorted(cell_of, i)
-        n = np.searchsorted(cell_of, i, "right") - first
-        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        point, cell = order[np.repeat(first, n) + within], np.repeat(j, n)
-        asked = np.zeros(len(order), dtype=bool)
-        asked[point] = True
+        number = np.searchsorted(cell_of, i, "right") - first
+        asked = np.isin(cell_of, i)
         x = np.empty((len(order), r.shape[1]))
-        x[asked] = self.x_of(points, r, asked)
-        numbers = np.unique(cell)
-        number = np.searchsorted(numbers, cell)
-        centres, radii = self._spheres(r[:, :3], numbers)
-        middle, normal, deviation = self._slabs(r[:, :3], numbers)
-        off = x[point, :3]
-        close = np.linalg.norm(off - centres[number], axis=1) < radii[number] + reach
-        close &= np.abs(np.sum((off - middle[number]) * normal[number], axis=1)) < deviation[number] + reach
-        point, cell = point[close], cell[close]
-        if not len(point):
-            return nowhere()
-        for parts, (X, shape) in zip(LATTICES, cells.lattices, strict=True):
-            used, which = np.unique(cell, return_inverse=True)
-            spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
-            start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
-            for some in np.array_split(np.arange(len(cell)), 1 + len(cell) * len(X) // MANY):
-                off = spread[which[some]] - x[point[some], None, :3]
-                away = np.einsum("nmi,nmi->nm", off, off)
-                start[some] = away.argmin(axis=1)
-                least[some] = np.sqrt(away[np.arange(len(some)), start[some]])
-            close = least < reach + BETWEEN / parts * radii[np.searchsorted(numbers, cell)]
-            point, cell, start = point[close], cell[close], start[close]
-            if not len(point):
-                return nowhere()
-        at = Places(point, cell, *project(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return self._away(points, at.of(at.distance < of_faces), r[:, :3])
+        x[order[asked]] = self.x_of(points, r, order[asked])
+        _, at = places_near(self._cells, r, x, (j, first, number, order), reach, of_faces)
+        return self._away(points, at, r[:, :3])
 
     def of_far_cells(self, points: Points, at: Places) -> Places:
         """Those in cells that are not near in the surface: others are not cut along each other."""

@@ -25,7 +25,7 @@ from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
-from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, FOLLOWING, ROUNDS
+from magshell_fenicsx.parts.touching.nearest import BULGE, FOLLOWING
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
 START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
+ROUNDS, EXACT = 30, 1e-10  # Newton's steps at most; after a smaller one, in the cell, the place is exact
+FLAT = 1e-3  # of the square of the speed: below it the step takes that
 SAME = 1e-9  # of h: places of two cells at the same distance are one
 
 
