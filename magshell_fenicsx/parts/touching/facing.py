@@ -16,12 +16,13 @@ from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
     BETWEEN,
     BULGE,
+    SHAPES,
     SIGNS,
     WAYS,
     Cells,
     Longs,
     Places,
-    jets,
+    Undeformed,
     near_pairs,
     places_near,
 )
@@ -33,7 +34,6 @@ MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs o
 MANY = 2_000_000  # distances of a point from a place at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
-BELOW = 0.5  # the sine of an angle between a surface and the way from a place to a point that is above it
 SHRUNK = 0.9  # of the way between corners of cells beside each other, less than which they are apart where these fold
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
@@ -69,6 +69,7 @@ class Facing:
         self._cells, self._rule, self._allowed, self._h = cells, rule, allowed, h
         self._r0, self._faces, self._comm = r0, faces, comm
         self._beside = cells.near_in_surface(r0, BESIDE * h)
+        self._known: tuple[Points, Array] = rule, self.x_of(rule, r0)  # undeformed places
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
@@ -150,40 +151,30 @@ class Facing:
     def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement, within a distance of
         faces or mid-surfaces."""
-        points, r = points or self._rule, self.placed(u, faces=faces)
-        return self._facing(points, self.places_in(points, u, r, reach), r[:, :3])
+        points = points or self._rule
+        return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach))
 
     def places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
         """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
         of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
         i, j = self._near_cells(u, reach)
-        cells = self._cells
         order, cell_of = points.by_cell
         first = np.searchsorted(cell_of, i)
         number = np.searchsorted(cell_of, i, "right") - first
-        asked = np.isin(cell_of, i)
-        x = np.empty((len(order), r.shape[1]))
-        x[order[asked]] = self.x_of(points, r, order[asked])
-        _, at = places_near(self._cells, r, x, (j, first, number, order), reach, of_faces)
-        return self._away(points, at, r[:, :3])
+        asked = order[np.isin(cell_of, i)]
+        x = np.zeros((len(order), r.shape[1]))
+        x[asked] = self.x_of(points, r, asked)
+        if self._known[0] is not points:
+            self._known = points, self.x_of(points, self._r0)
+        near = self._is_beside(i * len(self._cells.nodes) + j)
+        undeformed = Undeformed(near, self._r0, self._known[1], BESIDE * self._h)
+        return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed)[1]
 
     def of_far_cells(self, points: Points, at: Places) -> Places:
         """Those in cells that are not near in the surface: others are not cut along each other."""
         return at.of(~self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell))
 
-    def _away(self, points: Points, at: Places, r: Array) -> Places:
-        """Those that are not near their points within the surface: in cells beside each other, across a fold."""
-        beside = self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell)
-        if not beside.any():
-            return at
-        asked = at.of(beside)
-        (_, y), *_ = jets(self._cells.element, asked.X, self._r0[self._cells.nodes[asked.cell]], 0)
-        way = np.linalg.norm(self.x_of(points, self._r0, asked.point) - y, axis=1)
-        stays = ~beside
-        stays[beside] = (way > BESIDE * self._h) & self._above(points, asked, r)
-        return at.of(stays)
-
-    def _facing(self, points: Points, at: Places, r: Array) -> Places:
+    def _facing(self, points: Points, at: Places) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
         has one in each direction at most: on both sides of its own surface, and before its edge."""
         cells, number = self._cells, len(self._cells.nodes)
@@ -191,7 +182,7 @@ class Facing:
         order = np.argsort(keys, kind="stable")
         at, keys = at.of(order), keys[order]
         on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
-        above, beside = self._above(points, at, r), points.cell[at.point] * number
+        beside = points.cell[at.point] * number
         stays = np.ones(len(keys), dtype=bool)
         for side in range(3):
             beyond = cells.across[at.cell, side]
@@ -199,16 +190,13 @@ class Facing:
             there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
             listed = keys[there] == at.point * number + beyond
             nearer = at.distance[there] < at.distance - SAME * self._h
-            folded = above & self._is_beside(beside + beyond)  # what goes on there is not looked at
+            folded = at.above & self._is_beside(beside + beyond)  # what goes on there is not looked at
             stays &= ~asked | (listed & ~nearer) | folded
         at = at.of(stays)
         if not len(at.point):
             return at
         at = at.of(np.lexsort((at.distance, at.point)))
-        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        off = self.x_of(points, r, at.point) - y
-        way, numbers = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
-        rest = np.arange(len(off))
+        way, numbers, rest = at.way, np.full(len(at.point), WAYS - 1), np.arange(len(at.point))
         for number_of_way in range(WAYS - 1):
             first = np.flatnonzero(np.diff(at.point[rest], prepend=-1))
             nearest = np.repeat(rest[first], np.diff([*first, len(rest)]))
@@ -221,13 +209,6 @@ class Facing:
         first = at.firsts
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
-
-    def _above(self, points: Points, at: Places, r: Array) -> Inside:
-        """Whether places (n,) are below their points, and not beside them as in one surface that is flat."""
-        (_, y), (_, a1), (_, a2) = jets(self._cells.element, at.X, r[self._cells.nodes[at.cell]], 1)
-        off, normal = self.x_of(points, r, at.point) - y, np.cross(a1, a2)
-        level = np.linalg.norm(off, axis=1) * np.linalg.norm(normal, axis=1)
-        return np.asarray(np.abs(np.sum(off * normal, axis=1)) > BELOW * level)
 
     def left_to_edges(self, points: Points, at: Places, normals: Array) -> Inside:
         """Which places (n,) do not count: those of points inside a surface that face an edge of another one, steeply.
@@ -254,5 +235,5 @@ class Facing:
 
 def nowhere() -> Places:
     """No places."""
-    nothing = np.zeros(0, dtype=np.int64)
-    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
+    nothing, (X, free, distance, way) = np.zeros(0, dtype=np.int64), (np.zeros((0, *each)) for each in SHAPES)
+    return Places(nothing, nothing, X, free, distance, nothing, way, nothing > 0)

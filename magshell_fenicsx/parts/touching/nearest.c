@@ -9,6 +9,8 @@
 #define INWARDS 1e-17     /* a smaller change of a barycentric coordinate leads to no side */
 #define FLAT 1e-3         /* of the determinant of a plane's Hessian: below it the step takes the plane's */
 #define ON_SIDE 1e-12     /* a barycentric coordinate that is zero */
+#define BELOW 0.5         /* the sine of an angle between a surface and the way from a place to a point that is above it */
+#define BOUNDS 6          /* numbers of a cell */
 
 typedef double v __attribute__((vector_size(32), aligned(8)));
 
@@ -38,19 +40,19 @@ INLINE void jets(int degree, const v *of, const double *X, v *y)
 }
 
 /* Gradient g (2,) and Hessian A (xx, xy, yy) of half the square of the distance, see `slopes`, with that of a plane where it
-   is not convex; the distance is returned. */
-INLINE double convex(int degree, const v *of, const v *x, const double *X, double *g, double *A)
+   is not convex; y (6,) are the jets there, `off` the point less the place, with its length last. The distance is returned. */
+INLINE double convex(int degree, const v *of, const v *x, const double *X, v *y, v *off, double *g, double *A)
 {
     static const v SIGNS = {1.0, 1.0, 1.0, -1.0};
-    v y[6];
     jets(degree, of, X, y);
-    v off = *x - y[0];
-    const double length = sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]), distance = length + off[3];
-    off[3] = length;
-    g[0] = -dot(&off, y + 1), g[1] = -dot(&off, y + 2);
+    *off = *x - y[0];
+    const double length = sqrt((*off)[0] * (*off)[0] + (*off)[1] * (*off)[1] + (*off)[2] * (*off)[2]);
+    const double distance = length + (*off)[3];
+    (*off)[3] = length;
+    g[0] = -dot(off, y + 1), g[1] = -dot(off, y + 2);
     const v z1 = y[1] * SIGNS, z2 = y[2] * SIGNS;
     const double E = dot(y + 1, &z1), F = dot(y + 1, &z2), G = dot(y + 2, &z2);
-    A[0] = E - dot(&off, y + 3), A[1] = F - dot(&off, y + 4), A[2] = G - dot(&off, y + 5);
+    A[0] = E - dot(off, y + 3), A[1] = F - dot(off, y + 4), A[2] = G - dot(off, y + 5);
     if (A[0] * A[2] - A[1] * A[1] < FLAT * (E * G - F * F) || A[0] + A[2] <= 0.0)
         A[0] = E, A[1] = F, A[2] = G;
     return distance;
@@ -88,15 +90,17 @@ INLINE void freed(const double *X, const double *g, const double *A, double *fre
 }
 
 /* The place X (2,) of a cell that is nearest to a point, near the given one: Newton's method for half the square of the
-   distance, in the sides of the triangle where these are in the way. The distance is returned. */
-INLINE double nearest_in(int degree, const v *of, const v *x, double *X, double *free)
+   distance, in the sides of the triangle where these are in the way. The distance is returned, `way` (3,) is the direction
+   from there to the point, `above` whether that is above the surface. */
+INLINE double nearest_in(int degree, const v *of, const v *x, double *X, double *free, double *way, uint8_t *above)
 {
     double g[2], A[3], step[2], distance;
+    v y[6], off;
     for (int round = 0, moving = 1;; ++round) {
-        distance = convex(degree, of, x, X, g, A);
+        distance = convex(degree, of, x, X, y, &off, g, A);
         freed(X, g, A, free, step);
         if (!moving || round == ROUNDS)
-            return distance;
+            break;
         const double change[3] = {-step[0] - step[1], step[0], step[1]};
         double at[3] = {1.0 - (X[0] + X[1]), X[0], X[1]}, part = 1.0;
         int side = -1;
@@ -112,6 +116,15 @@ INLINE double nearest_in(int degree, const v *of, const v *x, double *X, double 
         X[1] = at[2] / all, X[0] = at[0] ? at[1] / all : 1.0 - X[1]; /* exactly on the side */
         moving = !(fabs(X[0] - before[0]) <= EXACT && fabs(X[1] - before[1]) <= EXACT);
     }
+    double high = 0.0, size = 0.0;
+    for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        const double normal = y[1][j] * y[2][k] - y[1][k] * y[2][j];
+        way[i] = off[i] / fmax(off[3], 1e-300);
+        high += way[i] * normal, size += normal * normal;
+    }
+    *above = fabs(high) > BELOW * sqrt(size);
+    return distance;
 }
 
 /* The number of a lattice's place that is nearest to a point, of places (3, count); the square of its distance. */
@@ -130,38 +143,51 @@ INLINE int64_t nearest_of(int64_t count, const double *places, const double *x, 
 }
 
 /* Cells of a degree by their monomials (cells, .., 4), with the places (cells, 3, count) of a coarse lattice and of a fine
-   one, which is X (count, 2); no place is farther than `between` (cells, 2) from all those of a lattice. */
+   one, which is X (count, 2). Bounds are centre and radius of a sphere around each, and what no place of it is farther than
+   from all those of the lattices. Those of the undeformed surface are of its monomials. */
 typedef struct {
-    int64_t degree;
-    const double *of, *coarse, *fine, *X, *between;
-    int64_t coarse_count, count;
+    int64_t degree, coarse_count, count;
+    const double *of, *undeformed, *coarse, *fine, *X, *bounds;
 } Cells;
 
 /* The places nearest to points x (.., 4) that are nearer than `within`: of each pair of a cell with points order[first] to
-   order[first + number - 1], near them by less than a `reach` of mid-surfaces. Their number is returned. */
+   order[first + number - 1], near them by less than a `reach` of mid-surfaces. Where cells are near in the surface, places
+   count that are below their points and farther than `apart` from x0 undeformed. Their number is returned. */
 FAST int64_t nearest(const Cells *all, int64_t pairs, const int64_t *cell, const int64_t *first, const int64_t *number,
-                     const int64_t *order, const double *x, double reach, double within, int64_t *point, int64_t *pair,
-                     double *X, double *free, double *distance)
+                     const uint8_t *near, const int64_t *order, const double *x, const double *x0, double reach,
+                     double within, double apart, int64_t *point, int64_t *pair, double *X, double *free,
+                     double *distance, double *way, uint8_t *above)
 {
     const int degree = (int)all->degree;
     const int64_t k = (all->degree + 1) * (all->degree + 2) / 2;
     int64_t found = 0;
     for (int64_t p = 0; p < pairs; ++p) {
-        const double *between = all->between + 2 * cell[p];
-        const v *of = (const v *)all->of + k * cell[p];
+        const double *bounds = all->bounds + BOUNDS * cell[p];
+        const v *of = (const v *)all->of + k * cell[p], *undeformed = (const v *)all->undeformed + k * cell[p];
         for (int64_t n = first[p]; n < first[p] + number[p]; ++n) {
-            const double *at = x + 4 * order[n];
+            const double *at = x + 4 * order[n], away[3] = {at[0] - bounds[0], at[1] - bounds[1], at[2] - bounds[2]};
+            const double far = reach + bounds[3];
+            if (away[0] * away[0] + away[1] * away[1] + away[2] * away[2] >= far * far)
+                continue;
             double least, *place = X + 2 * found;
             nearest_of(all->coarse_count, all->coarse + 3 * all->coarse_count * cell[p], at, &least);
-            if (!(sqrt(least) < reach + between[0]))
+            if (!(sqrt(least) < reach + bounds[4]))
                 continue;
             const int64_t start = nearest_of(all->count, all->fine + 3 * all->count * cell[p], at, &least);
-            if (!(sqrt(least) < reach + between[1]))
+            if (!(sqrt(least) < reach + bounds[5]))
                 continue;
             place[0] = all->X[2 * start], place[1] = all->X[2 * start + 1];
-            distance[found] = nearest_in(degree, of, (const v *)at, place, free + 4 * found);
-            if (distance[found] < within)
-                point[found] = order[n], pair[found++] = p;
+            distance[found] = nearest_in(degree, of, (const v *)at, place, free + 4 * found, way + 3 * found, above + found);
+            if (!(distance[found] < within))
+                continue;
+            if (near[p]) {
+                v y[6];
+                jets(degree, undeformed, place, y);
+                const v off = *((const v *)x0 + order[n]) - y[0];
+                if (!above[found] || dot(&off, &off) <= apart * apart)
+                    continue;
+            }
+            point[found] = order[n], pair[found++] = p;
         }
     }
     return found;

@@ -38,11 +38,15 @@ FOLLOWING = 2  # Newton's steps after a small change
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 WAYS = 3  # directions in which a point can face places: on both sides, and before an edge
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])  # of the squares of components in the Hessian
+SHAPES = (2,), (2, 2), (), (3,)  # of what places have: X, free, distance, way
 FUNCTIONS = """
-    typedef struct { int64_t degree; const double *of, *coarse, *fine, *X, *between; int64_t coarse_count, count; }
-        Cells;
-    int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const int64_t *,
-        const double *, double, double, int64_t *, int64_t *, double *, double *, double *);
+    typedef struct {
+        int64_t degree, coarse_count, count;
+        const double *of, *undeformed, *coarse, *fine, *X, *bounds;
+    } Cells;
+    int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const uint8_t *,
+        const int64_t *, const double *, const double *, double, double, double, int64_t *, int64_t *,
+        double *, double *, double *, double *, uint8_t *);
 """
 
 
@@ -165,6 +169,10 @@ class Places:
         (n,).
     side
         (n,): places in one direction from their point have one number, less than `WAYS`; 0 that of the nearest.
+    way
+        (n, 3) direction to the point.
+    above
+        (n,) whether the point is above the place, and not beside it as in one surface that is flat.
     """
 
     point: Longs
@@ -173,6 +181,8 @@ class Places:
     free: Array
     distance: Array
     side: Longs
+    way: Array
+    above: NDArray[np.bool_]
 
     @property
     def firsts(self) -> Longs:
@@ -184,6 +194,26 @@ class Places:
         return Places(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
+@dataclass(frozen=True)
+class Undeformed:
+    """What tells which pairs of points and places are near each other within the undeformed surface.
+
+    Attributes
+    ----------
+    near
+        (pairs,) whether the cells are near in the surface; only there places are asked.
+    r, x
+        (nodes, 3) and (n, 3) places of nodes and points.
+    apart
+        How far a place is at least.
+    """
+
+    near: NDArray[np.bool_]
+    r: Array
+    x: Array
+    apart: float
+
+
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
     """Shape functions (n, functions) at places (n, 2), and the field of nodal vectors (n, functions, 3 or 4) there:
     itself and its derivatives by the first coordinate, the second, and both twice."""
@@ -192,7 +222,13 @@ def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple
 
 
 def places_near(
-    cells: Cells, r: Array, x: Array, pairs: tuple[Longs, Longs, Longs, Longs], reach: float, within: float = np.inf
+    cells: Cells,
+    r: Array,
+    x: Array,
+    pairs: tuple[Longs, Longs, Longs, Longs],
+    reach: float,
+    within: float = np.inf,
+    undeformed: Undeformed | None = None,
 ) -> tuple[Longs, Places]:
     """The places of cells nearest to points that are nearer than `within`, with the numbers of their pairs.
 
@@ -212,24 +248,33 @@ def places_near(
     cell, first, number, order = pairs
     used, which = np.unique(cell, return_inverse=True)
     nodal = r[cells.nodes[used]]
-    centres = nodal[..., :3].mean(axis=1)
-    radii = BULGE * np.linalg.norm(nodal[..., :3] - centres[:, None], axis=2).max(axis=1)
-    most, widen = int(number.sum()), ((0, 0), (0, 4 - x.shape[1]))
-    placed = [np.matmul(nodal[..., :3].swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
-    of, between = np.pad(cells.monomials @ nodal, ((0, 0), *widen)), BETWEEN * radii[:, None] / LATTICES
-    (ffi, lib), point, pair = library(), np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
-    X, free, distance = np.empty((most, 2)), np.empty((most, 2, 2)), np.empty(most)
+    flat, where = nodal[..., :3], undeformed or Undeformed(np.zeros(len(cell), dtype=bool), r, x, 0.0)
+    centres = flat.mean(axis=1)
+    radii = BULGE * np.linalg.norm(flat - centres[:, None], axis=2).max(axis=1)
+    bounds = np.column_stack([centres, radii, *(BETWEEN / parts * radii for parts in LATTICES)])
+    placed = [np.matmul(flat.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
+    of = [cells.monomials @ _padded(each) for each in (nodal, where.r[cells.nodes[used]])]
+    ffi, lib = library()
 
-    def p(array: NDArray[Any]) -> Any:
-        return ffi.from_buffer("int64_t[]" if array.dtype == np.int64 else "double[]", array)
+    def p(*arrays: NDArray[Any]) -> list[Any]:
+        kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
+        return [ffi.from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each)) for each in arrays]
 
-    arrays = [of, *placed, cells.lattices[-1][0], between]
-    every = ffi.new("Cells *", [cells.element.degree, *map(p, arrays), *(table.shape[2] for table in placed)])
-    given = [np.ascontiguousarray(each, dtype=np.int64) for each in (which.ravel(), first, number, order)]
-    made, padded = (point, pair, X, free, distance), np.pad(x, widen)
-    count = lib.nearest(every, len(cell), *map(p, given), p(padded), reach, within, *map(p, made))
-    point, pair, X, free, distance = (each[:count] for each in made)
-    return pair, Places(point, cell[pair], X, free, distance, np.zeros(count, dtype=np.int64))
+    numbers = cells.element.degree, *(len(X) for X, _ in cells.lattices)
+    every = ffi.new("Cells *", [*numbers, *p(*of, *placed, cells.lattices[-1][0], bounds)])
+    most = int(number.sum())
+    point, pair = np.empty((2, most), dtype=np.int64)
+    made = point, pair, *(np.empty((most, *shape)) for shape in SHAPES), np.empty(most, dtype=bool)
+    given = p(which.ravel(), first, number, where.near, order, _padded(x), _padded(where.x))
+    count = lib.nearest(every, len(cell), *given, reach, within, where.apart, *p(*made))
+    X, free, distance, way = (each[:count] for each in made[2:6])
+    point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
+    return pair, Places(point, cell[pair], X, free, distance, none, way, above)
+
+
+def _padded(vectors: Array) -> Array:
+    """Those of three components with a fourth one."""
+    return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 4 - vectors.shape[-1]))], axis=-1)
 
 
 @cache

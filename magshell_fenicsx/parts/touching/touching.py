@@ -106,6 +106,7 @@ class Touching:
         self.look: Look | None = None
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
         self._about: Expanded | None = None
+        self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
 
     # as a term
 
@@ -135,8 +136,16 @@ class Touching:
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _entries(self) -> Entries:
+        """Those of the present state, once for the tangent and its products; of looks each time."""
+        at, *_ = self._pressed()
+        places, k, made = self._made
+        if places is at and k == self.stiffness.value and not self.look:
+            return made
         entries = self._by_parts()
-        return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        entries = self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        if not self.look:
+            self._made = at, self.stiffness.value, entries
+        return entries
 
     @property
     def since(self) -> float:
