@@ -59,19 +59,26 @@ def meetings(
     for a, b in every if [WHOLE, WHOLE] in [[*pair] for pair in pairs] else pairs:
         if a == b or a not in places or b not in places:
             continue
-        for one, other in ((a, b), (b, a)):
-            x = places[one]
-            away, which = scipy.spatial.KDTree(places[other]).query(x)
-            first = int(np.argmin(away))
-            alike = x[away < away.min() + ALIKE * thickness[one]]
-            if np.linalg.norm(alike - x[first], axis=1).max() >= apart[one]:
-                continue
-            ends = x[first], places[other][which[first]]
-            if one in charted and other in charted:
-                ends = _nearest(*ends, charted[one], charted[other])
-            if np.linalg.norm(ends[0] - ends[1]) < FAR * thickness[one]:
-                found[one].append(ends[0])
+        away = {a: _away(places[a], places[b]), b: _away(places[b], places[a])}
+        far, number = away[a]
+        nearest = int(np.argmin(far))
+        ends, alone = {a: places[a][nearest], b: places[b][number[nearest]]}, list[str]()
+        for name in (a, b):
+            alike = places[name][away[name][0] < far.min() + ALIKE * thickness[name]]
+            if np.linalg.norm(alike - ends[name], axis=1).max() < apart[name]:
+                alone.append(name)
+        if alone and a in charted and b in charted:
+            ends = dict(zip((a, b), _nearest(ends[a], ends[b], charted[a], charted[b]), strict=True))
+        for name in alone:
+            if np.linalg.norm(ends[a] - ends[b]) < FAR * thickness[name]:
+                found[name].append(ends[name])
     return found
+
+
+def _away(x: Array, y: Array) -> tuple[Array, NDArray[np.int64]]:
+    """How far the nearest of the places y is from each x, and its number."""
+    away, number = scipy.spatial.KDTree(y).query(x)
+    return np.asarray(away), np.asarray(number)
 
 
 @dataclass(frozen=True)

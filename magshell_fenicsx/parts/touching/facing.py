@@ -17,7 +17,6 @@ from magshell_fenicsx.parts.touching.nearest import (
     BETWEEN,
     BULGE,
     SHAPES,
-    SIGNS,
     WAYS,
     Cells,
     Longs,
@@ -25,6 +24,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     Undeformed,
     near_pairs,
     places_near,
+    places_of,
 )
 from magshell_fenicsx.parts.touching.segments import Points
 
@@ -79,8 +79,7 @@ class Facing:
 
     def x_of(self, points: Points, r: Array, which: Any = slice(None)) -> Array:
         """The places of some points."""
-        nodal = r[self._cells.nodes[points.cell[which]]] * SIGNS[: r.shape[1]]
-        return np.asarray(np.einsum("nk,nki->ni", points.shape[which], nodal))
+        return places_of(self._cells, r, points.cell[which], points.shape[which])
 
     def near_on_way(self, u: Array, v: Array) -> bool:
         """Whether any cells that may touch come near each other between two displacements; collective."""

@@ -192,3 +192,15 @@ FAST int64_t nearest(const Cells *all, int64_t pairs, const int64_t *cell, const
     }
     return found;
 }
+
+/* Places x (count, 4) of points with shape functions (count, k) in cells that have nodes (.., k) at r (.., 4). */
+FAST void places(int64_t count, int64_t k, const int64_t *cell, const int64_t *nodes, const double *shape, const double *r,
+                 double *x)
+{
+    for (int64_t n = 0; n < count; ++n) {
+        v sum = {0.0};
+        for (int64_t i = 0; i < k; ++i)
+            sum += *((const v *)r + nodes[k * cell[n] + i]) * shape[k * n + i];
+        *((v *)x + n) = sum;
+    }
+}

@@ -47,6 +47,7 @@ FUNCTIONS = """
     int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const uint8_t *,
         const int64_t *, const double *, const double *, double, double, double, int64_t *, int64_t *,
         double *, double *, double *, double *, uint8_t *);
+    void places(int64_t, int64_t, const int64_t *, const int64_t *, const double *, const double *, double *);
 """
 
 
@@ -254,13 +255,8 @@ def places_near(
     bounds = np.column_stack([centres, radii, *(BETWEEN / parts * radii for parts in LATTICES)])
     placed = [np.matmul(flat.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
     of = [cells.monomials @ _padded(each) for each in (nodal, where.r[cells.nodes[used]])]
-    ffi, lib = library()
-
-    def p(*arrays: NDArray[Any]) -> list[Any]:
-        kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
-        return [ffi.from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each)) for each in arrays]
-
     numbers = cells.element.degree, *(len(X) for X, _ in cells.lattices)
+    (ffi, lib), p = library(), _pointers
     every = ffi.new("Cells *", [*numbers, *p(*of, *placed, cells.lattices[-1][0], bounds)])
     most = int(number.sum())
     point, pair = np.empty((2, most), dtype=np.int64)
@@ -270,6 +266,19 @@ def places_near(
     X, free, distance, way = (each[:count] for each in made[2:6])
     point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
     return pair, Places(point, cell[pair], X, free, distance, none, way, above)
+
+
+def places_of(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
+    """Those (n, 3) of points with shape functions (n, functions) in cells (n,), with nodes at r; or (n, 4) of both."""
+    x = np.empty((len(cell), 4))
+    arrays = _pointers(cell, cells.nodes, shape, _padded(r * SIGNS[: r.shape[1]]), x)
+    library()[1].places(*shape.shape, *arrays)
+    return x[:, : r.shape[1]]
+
+
+def _pointers(*arrays: NDArray[Any]) -> list[Any]:
+    kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
+    return [library()[0].from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each)) for each in arrays]
 
 
 def _padded(vectors: Array) -> Array:
