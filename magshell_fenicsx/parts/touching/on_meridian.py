@@ -24,11 +24,11 @@ from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.curves import Faced, Rule, beside, nowhere
 from magshell_fenicsx.parts.touching.facing import ALIKE, STEEP
-from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 from magshell_fenicsx.parts.touching.nearest import BULGE, FOLLOWING
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 from magshell_fenicsx.parts.touching.section import Pair
-from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
+from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -39,7 +39,7 @@ FLAT = 1e-3  # of the square of the speed: below it the step takes that
 SAME = 1e-9  # of h: places of two cells at the same distance are one
 
 
-class MeridianTouching:
+class MeridianTouching(ContactTerm):
     """The energy of the contact of a pair on the meridian; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
 
     Parameters
@@ -50,14 +50,10 @@ class MeridianTouching:
         Of the quadrature.
     """
 
-    amplitude, column = None, ""
-
     def __init__(
         self, pair: Pair, r0: fem.Function, u: fem.Function, sides: tuple[Inside, Inside], h: float, degree: int
     ) -> None:
-        self.pair, self.name = pair, f"contact{pair.suffix}"
-        self.group = self.name
-        self.stiffness = Number(pair.stiffness)
+        super().__init__(pair)
         self._h, self._u = pair.thickness * h, u
         V = r0.function_space
         self._nodes = V.dofmap.list.astype(np.int64)
@@ -67,24 +63,12 @@ class MeridianTouching:
         self._normals = self._cell_normals()
         self._at: Array = np.full_like(self._r0, np.nan)
         self._places = nowhere()
-        self.looks: Sequence[Look] = ()  # see `InSteps`
-        self.look: Look | None = None
         self._looked_at = Kept[tuple[Array, Faced]]()
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
         k = self._element.degree
         self._start = np.linspace(0.0, 1.0, START * k + 1, dtype=np.float64)
 
     # as a term
-
-    @property
-    def history(self) -> dict[str, tuple[Number, float]]:
-        """See `FiniteElementSystem`."""
-        return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
-
-    def compile_residual(self) -> None:
-        """It has no forms."""
-
-    compile_tangent = compile_residual
 
     def energy(self) -> float:
         """Of the whole shell."""
@@ -102,14 +86,6 @@ class MeridianTouching:
         forces = np.zeros_like(self._r0)
         np.add.at(forces, nodes, -(weight[:, None] * beta)[..., None] * n[:, None])
         return forces
-
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
-
-    def entries(self) -> Entries:
-        """See `Coupled`."""
-        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _entries(self) -> Entries:
         H, nodes = self._second(0.0)

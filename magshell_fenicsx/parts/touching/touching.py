@@ -17,7 +17,7 @@ less H(x), plus h, so that |x - y| need not be the least. H follows from the dis
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -32,7 +32,7 @@ from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.expanded import Expanded
 from magshell_fenicsx.parts.touching.faces import ByGrowth, Faces, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
-from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number, of_each
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places, jets
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
@@ -46,14 +46,7 @@ PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
 
 
-@dataclass
-class Number:
-    """A number that a state sets."""
-
-    value: float
-
-
-class Touching:
+class Touching(ContactTerm):
     """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
 
     Parameters
@@ -72,9 +65,6 @@ class Touching:
         How far they are from the mid-surface where the thickness changes with the state; None where it does not.
     """
 
-    amplitude = None
-    column = ""
-
     def __init__(
         self,
         pair: Pair,
@@ -89,10 +79,8 @@ class Touching:
         comm: MPI.Comm,
         faces: Faces | None = None,
     ) -> None:
-        self.pair, self.name = pair, f"contact{pair.suffix}"
-        self.group = self.name
-        self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
-        rule = segments.rule
+        super().__init__(pair)
+        self.cuts, rule = Number(0.0), segments.rule
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
@@ -102,8 +90,6 @@ class Touching:
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
-        self.looks: Sequence[Look] = ()  # see `InSteps`
-        self.look: Look | None = None
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
         self._about: Expanded | None = None
         self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
@@ -113,12 +99,7 @@ class Touching:
     @property
     def history(self) -> dict[str, tuple[Number, float]]:
         """See `FiniteElementSystem`; without a number of its own, a state has the cuts of the undeformed surfaces."""
-        return {self.pair.setting: (self.stiffness, self.pair.stiffness), self.pair.cuts: (self.cuts, 0.0)}
-
-    def compile_residual(self) -> None:
-        """It has no forms."""
-
-    compile_tangent = compile_residual
+        return super().history | {self.pair.cuts: (self.cuts, 0.0)}
 
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
@@ -127,13 +108,6 @@ class Touching:
     def add_residual(self, b: Array, factor: float) -> None:
         of_looks = of_each(self, lambda: self._on_nodes(self._forces()))
         self._add(b, factor * np.sum(of_looks, axis=0))
-
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
-
-    def entries(self) -> Entries:
-        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _entries(self) -> Entries:
         """Those of the present state, once for the tangent and its products; of looks each time."""
