@@ -238,7 +238,7 @@ def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
     """This rank's part of the product of entries with a vector of all unknowns, as long as that."""
     product = np.zeros_like(v)
     for factor, (rows, columns, values) in entries:
-        np.add.at(product, rows, factor * values * v[columns])
+        product += np.bincount(rows, factor * values * v[columns], len(v))
     return product
 
 

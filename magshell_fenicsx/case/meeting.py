@@ -62,19 +62,20 @@ def meetings(
     for a, b in every if [WHOLE, WHOLE] in [[*pair] for pair in pairs] else pairs:
         if a == b or a not in places or b not in places:
             continue
-        for one, other in ((a, b), (b, a)):
-            x = places[one]
-            gaps, which = _gaps(x, places[other], half[one], half[other])
-            first = int(np.argmin(gaps))
-            h = 2 * float(half[one].mean())
-            alike = x[gaps < gaps.min() + ALIKE * h]
-            if np.linalg.norm(alike - x[first], axis=1).max() >= apart[one]:
-                continue
-            ends = x[first], places[other][which[first]]
-            if one in charted and other in charted:
-                ends = _nearest(*ends, charted[one], charted[other])
-            if np.linalg.norm(ends[0] - ends[1]) < FAR * h:
-                found[one].append(ends[0])
+        away = {one: _gaps(places[one], places[other], half[one], half[other]) for one, other in ((a, b), (b, a))}
+        gaps, number = away[a]
+        nearest = int(np.argmin(gaps))
+        ends, alone = {a: places[a][nearest], b: places[b][number[nearest]]}, list[str]()
+        h = {name: 2 * float(half[name].mean()) for name in (a, b)}
+        for name in (a, b):
+            alike = places[name][away[name][0] < gaps.min() + ALIKE * h[name]]
+            if np.linalg.norm(alike - ends[name], axis=1).max() < apart[name]:
+                alone.append(name)
+        if alone and a in charted and b in charted:
+            ends = dict(zip((a, b), _nearest(ends[a], ends[b], charted[a], charted[b]), strict=True))
+        for name in alone:
+            if np.linalg.norm(ends[a] - ends[b]) < FAR * h[name]:
+                found[name].append(ends[name])
     return found
 
 

@@ -25,7 +25,7 @@ from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_g
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.joints import Joint
-from magshell_fenicsx.parts.touching.nearest import Cells, project
+from magshell_fenicsx.parts.touching.nearest import Cells, places_near
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
@@ -205,7 +205,9 @@ class Tee:
         if not len(point):
             return nearest, Y, apart
         surface = Cells(self._element, self._of_all.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
-        foot, _, distance = project(surface, x[point], nodal[which], np.full((len(point), 2), 1 / 3))
+        each = which, np.arange(len(which)), np.ones(len(which), dtype=np.int64), point
+        pair, at = places_near(surface, self._r0, x, each, np.inf)
+        point, which, foot, distance = at.point, which[pair], at.X, at.distance
         order = np.lexsort((cells[which], np.round(distance, 12), point))  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
         nearest[point[best]], Y[point[best]], apart[point[best]] = cells[which[best]], foot[best], distance[best]

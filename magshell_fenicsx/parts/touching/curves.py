@@ -11,12 +11,14 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.touching.facing import ALIKE
-from magshell_fenicsx.parts.touching.nearest import BULGE, EXACT, FLAT, ROUNDS
+from magshell_fenicsx.parts.touching.nearest import BULGE
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
+ROUNDS, EXACT = 30, 1e-10  # Newton's steps at most; after a smaller one, in the cell, the place is exact
+FLAT = 1e-3  # of the square of the speed: below it the step takes that
 START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
 SAME = 1e-9  # of h: places of two cells at the same distance are one
 SIGNS = np.array([1.0, 1.0, -1.0])  # of the squares of components in A

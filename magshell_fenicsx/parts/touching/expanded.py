@@ -59,12 +59,13 @@ class Expanded:
         x, nodal = facing.x_of(self.points, r, at.point), r[cells.nodes[at.cell]]
         X = followed(cells, x, nodal, at.X, at.free)
         (_, y), *_ = jets(cells.element, X, nodal, 0)
-        distance = distances(x - y)
+        off, distance = (x - y)[:, :3], distances(x - y)
         change = distance - at.distance
         mean = np.bincount(joined.group, joined.weight * change, len(joined.first))
         weight = joined.weight * (1 - (change - mean[joined.group]) / (BLUR * h))
         joined = replace(joined, distance=joined.distance + mean, weight=weight)
-        return replace(at, X=X, distance=distance), joined, expanded(h - joined.distance, self.depth, k, SOFT * h)
+        at = replace(at, X=X, distance=distance, way=off / np.linalg.norm(off, axis=1)[:, None])
+        return at, joined, expanded(h - joined.distance, self.depth, k, SOFT * h)
 
 
 def _area(cells: Cells, r0: Array, points: Points) -> Array:

@@ -15,27 +15,27 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.touching.faces import Faces
 from magshell_fenicsx.parts.touching.nearest import (
     BESIDE,
+    BETWEEN,
     BULGE,
-    LATTICES,
-    SIGNS,
+    SHAPES,
     WAYS,
     Cells,
     Longs,
     Places,
+    Undeformed,
     jets,
     near_pairs,
-    project,
+    places_near,
+    places_of,
 )
 from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
 MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
-BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
 MANY = 2_000_000  # distances of a point from a place at a time
 BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
-BELOW = 0.5  # the sine of an angle between a surface and the way from a place to a point that is above it
 SHRUNK = 0.9  # of the way between corners of cells beside each other, less than which they are apart where these fold
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
@@ -73,6 +73,8 @@ class Facing:
         self.half: Array = faces.undeformed if faces else np.full(len(r0), h / 2)  # undeformed, at all nodes
         self._thickest = 2 * float(self.half.max())
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
+        self._undeformed = np.column_stack([r0, self.half])
+        self._known: tuple[Points, Array] = rule, self.x_of(rule, self._undeformed)
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
@@ -83,8 +85,7 @@ class Facing:
 
     def x_of(self, points: Points, r: Array, which: Any = slice(None)) -> Array:
         """The places of some points."""
-        nodal = r[self._cells.nodes[points.cell[which]]] * SIGNS[: r.shape[1]]
-        return np.asarray(np.einsum("nk,nki->ni", points.shape[which], nodal))
+        return places_of(self._cells, r, points.cell[which], points.shape[which])
 
     def near_on_way(self, u: Array, v: Array) -> bool:
         """Whether any cells that may touch come near each other between two displacements; collective."""
@@ -101,16 +102,6 @@ class Facing:
         nodal = r[self._cells.nodes[cell]]
         centres = nodal.mean(axis=1)
         return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-
-    def _slabs(self, r: Array, cell: Longs) -> tuple[Array, Array, Array]:
-        """Planes through the middle of cells, with their normals, and how far the cells are from these at most."""
-        nodal, corners = r[self._cells.nodes[cell]], self._cells.at_corners @ r[self._cells.nodes[cell]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-        height = np.einsum("nki,ni->nk", nodal - corners[:, :1], normal)
-        low, high = height.min(axis=1), height.max(axis=1)
-        middle = corners[:, 0] + ((low + high) / 2)[:, None] * normal
-        return np.asarray(middle), np.asarray(normal), np.asarray(self._cells.overshoot * (high - low) / 2)
 
     def _fit(self, i: Longs, j: Longs, far: float = 0.0, *displaced: Array) -> tuple[Longs, Longs]:
         """The pairs of cells that may touch; of those beside each other where one of some surfaces is folded."""
@@ -185,64 +176,28 @@ class Facing:
     def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement, within a distance of
         faces or mid-surfaces."""
-        points, r = points or self._rule, self.placed(u, faces=faces)
-        return self._facing(points, self.places_in(points, u, r, reach), r[:, :3])
+        points = points or self._rule
+        return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach))
 
     def places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
         """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
         of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
         i, j = self._near_cells(u, reach)
-        cells = self._cells
         order, cell_of = points.by_cell
         first = np.searchsorted(cell_of, i)
-        n = np.searchsorted(cell_of, i, "right") - first
-        within = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        point, cell = order[np.repeat(first, n) + within], np.repeat(j, n)
-        asked = np.zeros(len(order), dtype=bool)
-        asked[point] = True
-        x = np.empty((len(order), r.shape[1]))
+        number = np.searchsorted(cell_of, i, "right") - first
+        asked = order[np.isin(cell_of, i)]
+        x = np.zeros((len(order), r.shape[1]))
         x[asked] = self.x_of(points, r, asked)
-        numbers = np.unique(cell)
-        number = np.searchsorted(numbers, cell)
-        centres, radii = self._spheres(r[:, :3], numbers)
-        middle, normal, deviation = self._slabs(r[:, :3], numbers)
-        off = x[point, :3]
-        close = np.linalg.norm(off - centres[number], axis=1) < radii[number] + reach
-        close &= np.abs(np.sum((off - middle[number]) * normal[number], axis=1)) < deviation[number] + reach
-        point, cell = point[close], cell[close]
-        if not len(point):
-            return nowhere()
-        for parts, (X, shape) in zip(LATTICES, cells.lattices, strict=True):
-            used, which = np.unique(cell, return_inverse=True)
-            spread = np.einsum("mk,nki->nmi", shape, r[cells.nodes[used], :3])
-            start, least = np.zeros(len(cell), dtype=np.int64), np.zeros(len(cell))
-            for some in np.array_split(np.arange(len(cell)), 1 + len(cell) * len(X) // MANY):
-                off = spread[which[some]] - x[point[some], None, :3]
-                away = np.einsum("nmi,nmi->nm", off, off)
-                start[some] = away.argmin(axis=1)
-                least[some] = np.sqrt(away[np.arange(len(some)), start[some]])
-            close = least < reach + BETWEEN / parts * radii[np.searchsorted(numbers, cell)]
-            point, cell, start = point[close], cell[close], start[close]
-            if not len(point):
-                return nowhere()
-        at = Places(point, cell, *project(cells, x[point], r[cells.nodes[cell]], X[start]), 0 * point)
-        return self._away(points, at.of(at.distance < of_faces), r[:, :3])
+        if self._known[0] is not points:
+            self._known = points, self.x_of(points, self._undeformed)
+        near = self._is_beside(i * len(self._cells.nodes) + j)
+        undeformed = Undeformed(near, self._undeformed, self._known[1], BESIDE)
+        return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed)[1]
 
     def of_far_cells(self, points: Points, at: Places) -> Places:
         """Those in cells that are not near in the surface: others are not cut along each other."""
         return at.of(~self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell))
-
-    def _away(self, points: Points, at: Places, r: Array) -> Places:
-        """Those that are not near their points within the surface: in cells beside each other, across a fold."""
-        beside = self._is_beside(points.cell[at.point] * len(self._cells.nodes) + at.cell)
-        if not beside.any():
-            return at
-        asked = at.of(beside)
-        (_, y), *_ = jets(self._cells.element, asked.X, self._r0[self._cells.nodes[asked.cell]], 0)
-        way = np.linalg.norm(self.x_of(points, self._r0, asked.point) - y, axis=1)
-        stays = ~beside
-        stays[beside] = (way > BESIDE * self.thickness(points, asked)) & self._above(points, asked, r)
-        return at.of(stays)
 
     def thickness(self, points: Points, at: Places) -> Array:
         """The mean undeformed thickness (n,) at points and their places, over R."""
@@ -250,7 +205,7 @@ class Facing:
         here = np.sum(points.shape[at.point] * self.half[self._cells.nodes[points.cell[at.point]]], axis=1)
         return np.asarray(here + there[:, 0])
 
-    def _facing(self, points: Points, at: Places, r: Array) -> Places:
+    def _facing(self, points: Points, at: Places) -> Places:
         """Of all places those that are nearest: the surface goes on from none of them to a nearer one, and each point
         has one in each direction at most: on both sides of its own surface, and before its edge."""
         cells, number = self._cells, len(self._cells.nodes)
@@ -258,7 +213,7 @@ class Facing:
         order = np.argsort(keys, kind="stable")
         at, keys = at.of(order), keys[order]
         on = np.column_stack([1 - at.X.sum(axis=1), at.X]) == 0.0
-        above, beside = self._above(points, at, r), points.cell[at.point] * number
+        beside = points.cell[at.point] * number
         stays = np.ones(len(keys), dtype=bool)
         for side in range(3):
             beyond = cells.across[at.cell, side]
@@ -266,16 +221,13 @@ class Facing:
             there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
             listed = keys[there] == at.point * number + beyond
             nearer = at.distance[there] < at.distance - SAME * self._h
-            folded = above & self._is_beside(beside + beyond)  # what goes on there is not looked at
+            folded = at.above & self._is_beside(beside + beyond)  # what goes on there is not looked at
             stays &= ~asked | (listed & ~nearer) | folded
         at = at.of(stays)
         if not len(at.point):
             return at
         at = at.of(np.lexsort((at.distance, at.point)))
-        (_, y), *_ = jets(cells.element, at.X, r[cells.nodes[at.cell]], 0)
-        off = self.x_of(points, r, at.point) - y
-        way, numbers = off / np.maximum(np.linalg.norm(off, axis=1), 1e-300)[:, None], np.full(len(off), WAYS - 1)
-        rest = np.arange(len(off))
+        way, numbers, rest = at.way, np.full(len(at.point), WAYS - 1), np.arange(len(at.point))
         for number_of_way in range(WAYS - 1):
             first = np.flatnonzero(np.diff(at.point[rest], prepend=-1))
             nearest = np.repeat(rest[first], np.diff([*first, len(rest)]))
@@ -288,13 +240,6 @@ class Facing:
         first = at.firsts
         least = np.repeat(at.distance[first], np.diff([*first, len(order)]))
         return at.of(at.distance < least + SAME * self._h)
-
-    def _above(self, points: Points, at: Places, r: Array) -> Inside:
-        """Whether places (n,) are below their points, and not beside them as in one surface that is flat."""
-        (_, y), (_, a1), (_, a2) = jets(self._cells.element, at.X, r[self._cells.nodes[at.cell]], 1)
-        off, normal = self.x_of(points, r, at.point) - y, np.cross(a1, a2)
-        level = np.linalg.norm(off, axis=1) * np.linalg.norm(normal, axis=1)
-        return np.asarray(np.abs(np.sum(off * normal, axis=1)) > BELOW * level)
 
     def left_to_edges(self, points: Points, at: Places, normals: Array) -> Inside:
         """Which places (n,) do not count: those of points inside a surface that face an edge of another one, steeply.
@@ -321,5 +266,5 @@ class Facing:
 
 def nowhere() -> Places:
     """No places."""
-    nothing = np.zeros(0, dtype=np.int64)
-    return Places(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), nothing)
+    nothing, (X, free, distance, way) = np.zeros(0, dtype=np.int64), (np.zeros((0, *each)) for each in SHAPES)
+    return Places(nothing, nothing, X, free, distance, nothing, way, nothing > 0)

@@ -14,6 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.parts.gap import ROUNDING, penalty
 from magshell_fenicsx.parts.touching.section import Pair
 
@@ -168,3 +169,45 @@ def of_each(contact: InSteps, of: Callable[[], Of], *, tangent: bool = False) ->
         found.append(of())
     contact.look = None
     return found
+
+
+@dataclass
+class Number:
+    """A number that a state sets."""
+
+    value: float
+
+
+class ContactTerm:
+    """What the contacts of a pair are as terms, on surfaces and on meridians; `_entries` are those at one look."""
+
+    amplitude = None
+    column = ""
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair, self.name = pair, f"contact{pair.suffix}"
+        self.group = self.name
+        self.stiffness = Number(pair.stiffness)
+        self.looks: Sequence[Look] = ()  # see `InSteps`
+        self.look: Look | None = None
+
+    @property
+    def history(self) -> dict[str, tuple[Number, float]]:
+        """See `FiniteElementSystem`."""
+        return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
+
+    def compile_residual(self) -> None:
+        """It has no forms."""
+
+    compile_tangent = compile_residual
+
+    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
+        """None here: what assembles the others adds `entries`."""
+
+    def entries(self) -> Entries:
+        """See `Coupled`."""
+        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)  # type: ignore[arg-type]
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def _entries(self) -> Entries:
+        raise NotImplementedError

@@ -9,14 +9,18 @@ the other sign. The distance is then that of the faces and h: |x - y| of the thr
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy
 import scipy.sparse
+from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
+
+from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -24,22 +28,27 @@ BESIDE = (
     4.8  # thicknesses of the way along sides of cells to what a point cannot touch: that is at most 1.2 times as long
 )
 BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
+BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
 LATTICES = (
     4,
     12,
 )  # parts of the sides of cells, between which the search for the nearest place begins: coarse, then fine
 STRIP = 500  # vertices from which ways are searched together
-ROUNDS = 30  # Newton's steps at most
-EXACT = 1e-10  # after a smaller step, in the reference cell, the place is exact: steps converge quadratically
-INWARDS = 1e-17  # a smaller change of a barycentric coordinate leads to no side
 FOLLOWING = 2  # Newton's steps after a small change
-FLAT = 1e-3  # of the determinant of a plane's Hessian: below it the step takes the plane's
-ON_SIDE = 1e-12  # a barycentric coordinate that is zero
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-SIDES = np.array([[-1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])  # direction of the side opposite to each corner
-DOWN = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # derivatives of the barycentric coordinates
 WAYS = 3  # directions in which a point can face places: on both sides, and before an edge
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])  # of the squares of components in the Hessian
+SHAPES = (2,), (2, 2), (), (3,)  # of what places have: X, free, distance, way
+FUNCTIONS = """
+    typedef struct {
+        int64_t degree, coarse_count, count;
+        const double *of, *undeformed, *coarse, *fine, *X, *bounds;
+    } Cells;
+    int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const uint8_t *,
+        const int64_t *, const double *, const double *, double, double, double, int64_t *, int64_t *,
+        double *, double *, double *, double *, uint8_t *);
+    void places(int64_t, int64_t, const int64_t *, const int64_t *, const double *, const double *, double *);
+"""
 
 
 @dataclass(frozen=True)
@@ -107,10 +116,10 @@ class Cells:
         return np.asarray(self.element.tabulate(0, CORNERS)[0, :, :, 0])
 
     @cached_property
-    def overshoot(self) -> float:
-        """The largest value in a cell of what is at most 1 at its nodes (Lebesgue's constant)."""
-        _, fine = self.lattices[-1]
-        return float(np.abs(fine).sum(axis=1).max())
+    def monomials(self) -> Array:
+        """(monomials, functions): polynomials x^(n-j) y^j, n up to the degree, j from 0 to n, from values at nodes."""
+        x, y = self.element.points.T
+        return np.linalg.inv([x ** (n - j) * y**j for n in range(self.element.degree + 1) for j in range(n + 1)]).T
 
     def near_in_surface(self, r0: Array, far: Array) -> Longs:
         """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than the mean of
@@ -163,6 +172,10 @@ class Places:
         (n,).
     side
         (n,): places in one direction from their point have one number, less than `WAYS`; 0 that of the nearest.
+    way
+        (n, 3) direction to the point.
+    above
+        (n,) whether the point is above the place, and not beside it as in one surface that is flat.
     """
 
     point: Longs
@@ -171,6 +184,8 @@ class Places:
     free: Array
     distance: Array
     side: Longs
+    way: Array
+    above: NDArray[np.bool_]
 
     @property
     def firsts(self) -> Longs:
@@ -182,6 +197,26 @@ class Places:
         return Places(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
+@dataclass(frozen=True)
+class Undeformed:
+    """What tells which pairs of points and places are near each other within the undeformed surface.
+
+    Attributes
+    ----------
+    near
+        (pairs,) whether the cells are near in the surface; only there places are asked.
+    r, x
+        (nodes, 4) and (n, 4) places of nodes and points, with half the thickness, of points with the other sign.
+    apart
+        How far a place is at least, over the mean of both thicknesses.
+    """
+
+    near: NDArray[np.bool_]
+    r: Array
+    x: Array
+    apart: float
+
+
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
     """Shape functions (n, functions) at places (n, 2), and the field of nodal vectors (n, functions, 3 or 4) there:
     itself and its derivatives by the first coordinate, the second, and both twice."""
@@ -189,45 +224,74 @@ def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple
         yield table, np.einsum("nk,nki->ni", table, nodal)
 
 
-def project(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Array, Array]:
-    """The places of triangles that are nearest to points, near the given ones.
+def places_near(
+    cells: Cells,
+    r: Array,
+    x: Array,
+    pairs: tuple[Longs, Longs, Longs, Longs],
+    reach: float,
+    within: float = np.inf,
+    undeformed: Undeformed | None = None,
+) -> tuple[Longs, Places]:
+    """The places of cells nearest to points that are nearer than `within`, with the numbers of their pairs.
 
-    Newton's method for half the square of the distance, in the sides of the triangle where these are in the way.
+    Where the search begins is the nearest place of a lattice. Compiled, see nearest.c.
 
     Parameters
     ----------
+    r
+        (nodes, 3) places of all nodes, or (nodes, 4).
     x
         (n, 3) points, or (n, 4).
-    nodal
-        (n, functions, 3 or 4) of the triangles.
-    X
-        (n, 2) in the reference triangle.
-
-    Returns
-    -------
-    X, free, distance
-        See `Places`.
+    pairs
+        Of a cell with points: the cells, the first of the points in the last array, and how many there are.
+    reach
+        Between points and mid-surfaces.
     """
-    X, moving = np.array(X), np.arange(len(X))
-    for _ in range(ROUNDS):
-        if not len(moving):
-            break
-        at, some = X[moving], nodal[moving]
-        g, A = _convex(cells, x[moving], some, at)
-        free = _free(at, g, A)
-        step = -_reduced(free, A, g)
-        coordinates, change = _barycentric(at), step @ DOWN.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(change < -INWARDS, -coordinates / change, np.inf)
-        part = np.minimum(room.min(axis=1), 1.0)
-        after = at + part[:, None] * step
-        hit = _barycentric(after)
-        hit[np.abs(hit) < ON_SIDE] = 0.0
-        hit[np.arange(len(hit)), room.argmin(axis=1)] *= room.min(axis=1) > 1.0
-        X[moving] = (hit / hit.sum(axis=1, keepdims=True))[:, 1:]
-        moving = moving[np.abs(X[moving] - at).max(axis=1) > EXACT]
-    (_, y), *_ = jets(cells.element, X, nodal, 0)
-    return X, free_at(cells, x, nodal, X), distances(x - y)
+    cell, first, number, order = pairs
+    used, which = np.unique(cell, return_inverse=True)
+    nodal = r[cells.nodes[used]]
+    flat, where = nodal[..., :3], undeformed or Undeformed(np.zeros(len(cell), dtype=bool), r, x, 0.0)
+    centres = flat.mean(axis=1)
+    radii = BULGE * np.linalg.norm(flat - centres[:, None], axis=2).max(axis=1)
+    bounds = np.column_stack([centres, radii, *(BETWEEN / parts * radii for parts in LATTICES)])
+    placed = [np.matmul(flat.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
+    of = [cells.monomials @ _padded(each) for each in (nodal, where.r[cells.nodes[used]])]
+    numbers = cells.element.degree, *(len(X) for X, _ in cells.lattices)
+    (ffi, lib), p = library(), _pointers
+    every = ffi.new("Cells *", [*numbers, *p(*of, *placed, cells.lattices[-1][0], bounds)])
+    most = int(number.sum())
+    point, pair = np.empty((2, most), dtype=np.int64)
+    made = point, pair, *(np.empty((most, *shape)) for shape in SHAPES), np.empty(most, dtype=bool)
+    given = p(which.ravel(), first, number, where.near, order, _padded(x), _padded(where.x))
+    count = lib.nearest(every, len(cell), *given, reach, within, where.apart, *p(*made))
+    X, free, distance, way = (each[:count] for each in made[2:6])
+    point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
+    return pair, Places(point, cell[pair], X, free, distance, none, way, above)
+
+
+def places_of(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
+    """Those (n, 3) of points with shape functions (n, functions) in cells (n,), with nodes at r; or (n, 4) of both."""
+    x = np.empty((len(cell), 4))
+    arrays = _pointers(cell, cells.nodes, shape, _padded(r * SIGNS[: r.shape[1]]), x)
+    library()[1].places(*shape.shape, *arrays)
+    return x[:, : r.shape[1]]
+
+
+def _pointers(*arrays: NDArray[Any]) -> list[Any]:
+    kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
+    return [library()[0].from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each)) for each in arrays]
+
+
+def _padded(vectors: Array) -> Array:
+    """Those of three components with a fourth one."""
+    return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 4 - vectors.shape[-1]))], axis=-1)
+
+
+@cache
+def library() -> tuple[Any, Any]:
+    """The cffi objects of nearest.c, compiled on first use."""
+    return native(Path(__file__).with_name("nearest.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
 def followed(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -> Array:
@@ -249,24 +313,6 @@ def straight(off: Array) -> Array:
     return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
 
-def free_at(cells: Cells, x: Array, nodal: Array, X: Array) -> Array:
-    """The directions in which places can move, see `Places`."""
-    return _free(X, *_convex(cells, x, nodal, X))
-
-
-def _convex(cells: Cells, x: Array, nodal: Array, X: Array) -> tuple[Array, Array]:
-    """Gradient and Hessian of half the square of the distance, with that of a plane where it is not convex."""
-    (_, y), (_, y1), (_, y2), (_, y11), (_, y12), (_, y22) = jets(cells.element, X, nodal)
-    g, A = slopes(straight(x - y), y1, y2, y11, y12, y22)
-    plane = slopes(0 * y, y1, y2, y11, y12, y22)[1]
-    bent = (determinant(A) < FLAT * determinant(plane)) | (np.trace(A, axis1=1, axis2=2) <= 0)
-    return g, np.where(bent[:, None, None], plane, A)
-
-
-def _barycentric(X: Array) -> Array:
-    return np.column_stack([1 - X.sum(axis=1), X])
-
-
 def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array) -> tuple[Array, Array]:
     """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2, 2).
 
@@ -280,27 +326,6 @@ def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array)
     mixed = dot(y1, z2) - dot(off, y12)
     A = np.stack([dot(y1, z1) - dot(off, y11), mixed, mixed, dot(y2, z2) - dot(off, y22)], axis=1).reshape(-1, 2, 2)
     return -np.stack([dot(off, y1), dot(off, y2)], axis=1), A
-
-
-def _free(X: Array, g: Array, A: Array) -> Array:
-    """The directions as columns (n, 2, 2) in which places can move, see `Places`.
-
-    From a side or a corner a place goes inside if Newton's step does; else along a side if the distance falls there.
-    """
-    on = _barycentric(X) <= ON_SIDE
-    free = np.tile(np.eye(2), (len(X), 1, 1))
-    inward = _reduced(free, A, -g) @ DOWN.T
-    out = (on & (inward < 0)).any(axis=1)
-    for side in range(3):
-        free[out & on[:, side] & (on.sum(axis=1) == 1)] = np.column_stack([SIDES[side], np.zeros(2)])
-    for corner in range(3):
-        here = np.flatnonzero(out & (on.sum(axis=1) == 2) & ~on[:, corner])
-        ways = [CORNERS[c] - CORNERS[corner] for c in range(3) if c != corner]
-        gain = np.stack([np.maximum(-g[here] @ w, 0) ** 2 / np.einsum("i,nij,j->n", w, A[here], w) for w in ways], 1)
-        free[here] = 0.0
-        for k, way in enumerate(ways):
-            free[here[(gain[:, k] > 0) & (gain[:, k] >= gain[:, 1 - k])]] = np.column_stack([way, np.zeros(2)])
-    return free
 
 
 def _reduced(free: Array, A: Array, g: Array) -> Array:

@@ -28,17 +28,17 @@ from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Close, Curves, Faced, distances, nowhere, slopes
 from magshell_fenicsx.parts.touching.facing import STEEP
-from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 from magshell_fenicsx.parts.touching.nearest import FOLLOWING
 from magshell_fenicsx.parts.touching.section import Pair
-from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH, Number
+from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
 
 
-class MeridianTouching:
+class MeridianTouching(ContactTerm):
     """The energy of the contact of a pair on the meridian; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
 
     Parameters
@@ -53,8 +53,6 @@ class MeridianTouching:
         What multiplies h, (1,); None for 1.
     """
 
-    amplitude, column = None, ""
-
     def __init__(
         self,
         pair: Pair,
@@ -65,9 +63,7 @@ class MeridianTouching:
         degree: int,
         thickness: fem.Function | None = None,
     ) -> None:
-        self.pair, self.name = pair, f"contact{pair.suffix}"
-        self.group = self.name
-        self.stiffness = Number(pair.stiffness)
+        super().__init__(pair)
         self._h, self._u, self._placement, self._thickness = h, u, r0, thickness
         V = r0.function_space
         self._nodes = V.dofmap.list.astype(np.int64)
@@ -80,23 +76,11 @@ class MeridianTouching:
         self._thinnest, self._far = 2 * float(of_both.min()), h + (REACH - 1) * 2 * float(of_both.max())
         self._at: Array = np.full_like(self._r0, np.nan)
         self._places = nowhere()
-        self.looks: Sequence[Look] = ()  # see `InSteps`
-        self.look: Look | None = None
         self._looked_at = Kept[tuple[Array, Faced]]()
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
         self._close = Close(self._rule, self._nodes, sides, V.element.basix_element)
 
     # as a term
-
-    @property
-    def history(self) -> dict[str, tuple[Number, float]]:
-        """See `FiniteElementSystem`."""
-        return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
-
-    def compile_residual(self) -> None:
-        """It has no forms."""
-
-    compile_tangent = compile_residual
 
     def energy(self) -> float:
         """Of the whole shell."""
@@ -114,14 +98,6 @@ class MeridianTouching:
         forces = np.zeros_like(self._r0)
         np.add.at(forces, nodes, -(weight[:, None] * beta)[..., None] * n[:, None])
         return forces
-
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
-
-    def entries(self) -> Entries:
-        """See `Coupled`."""
-        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _entries(self) -> Entries:
         H, nodes = self._second(0.0)

@@ -16,8 +16,7 @@ Where the thickness varies, half of it H at nodes is a fourth unknown: d is then
 plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from dolfinx import fem
@@ -32,7 +31,7 @@ from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, b
 from magshell_fenicsx.parts.touching.expanded import Expanded
 from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
-from magshell_fenicsx.parts.touching.in_steps import Along, Kept, Look, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number, of_each
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
@@ -46,14 +45,7 @@ PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
 
 
-@dataclass
-class Number:
-    """A number that a state sets."""
-
-    value: float
-
-
-class Touching:
+class Touching(ContactTerm):
     """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
 
     Parameters
@@ -76,9 +68,6 @@ class Touching:
         How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
     """
 
-    amplitude = None
-    column = ""
-
     def __init__(
         self,
         pair: Pair,
@@ -95,10 +84,8 @@ class Touching:
         shape: Shape,
         faces: Faces | None = None,
     ) -> None:
-        self.pair, self.name = pair, f"contact{pair.suffix}"
-        self.group = self.name
-        self.stiffness, self.cuts = Number(pair.stiffness), Number(0.0)
-        rule = segments.rule
+        super().__init__(pair)
+        self.cuts, rule = Number(0.0), segments.rule
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
         self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
@@ -110,22 +97,16 @@ class Touching:
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
-        self.looks: Sequence[Look] = ()  # see `InSteps`
-        self.look: Look | None = None
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
         self._about: Expanded | None = None
+        self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
 
     # as a term
 
     @property
     def history(self) -> dict[str, tuple[Number, float]]:
         """See `FiniteElementSystem`; without a number of its own, a state has the cuts of the undeformed surfaces."""
-        return {self.pair.setting: (self.stiffness, self.pair.stiffness), self.pair.cuts: (self.cuts, 0.0)}
-
-    def compile_residual(self) -> None:
-        """It has no forms."""
-
-    compile_tangent = compile_residual
+        return super().history | {self.pair.cuts: (self.cuts, 0.0)}
 
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
@@ -135,16 +116,17 @@ class Touching:
         of_looks = of_each(self, lambda: self._on_nodes(self._forces()))
         self._add(b, factor * np.sum(of_looks, axis=0))
 
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
-
-    def entries(self) -> Entries:
-        rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-
     def _entries(self) -> Entries:
+        """Those of the present state, once for the tangent and its products; of looks each time."""
+        at, *_ = self._pressed()
+        places, k, made = self._made
+        if places is at and k == self.stiffness.value and not self.look:
+            return made
         entries = self._by_parts()
-        return self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        entries = self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        if not self.look:
+            self._made = at, self.stiffness.value, entries
+        return entries
 
     @property
     def since(self) -> float:
@@ -444,6 +426,7 @@ class Touching:
 
     def expand_about(self, pressed: Expanded) -> None:
         """Take for good what is pressed in another scene on the same mesh, see `expanded`."""
+        self._made = None, 0.0, self._made[2]
         self._about = pressed.on(self._r0)
 
     def _geometry(self, at: Places) -> tuple[Array, Array, Array, Longs]:
