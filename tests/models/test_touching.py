@@ -238,8 +238,6 @@ def test_a_step_that_passes_through() -> None:
     [
         ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
         ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
-        ({"loading": {"kind": "pressure", "until": "bifurcation", "then": "follow"}}, "then: follow: with contact"),
-        ({"loading": {"kind": "pressure", "search": {}}}, "search: with contact between shells"),
     ],
 )
 def test_what_is_refused(changed: dict[str, Any], said: str) -> None:
