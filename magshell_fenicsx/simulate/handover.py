@@ -32,7 +32,7 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import of_its_own, passes, with_cuts_here
-from magshell_fenicsx.simulate.transfer import nodes_of_shells
+from magshell_fenicsx.simulate.transfer import of_shells
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, branch
 
 Array = NDArray[np.float64]
@@ -312,7 +312,6 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     assert isinstance(mirror, Mirror)
     parts = [old.model.r0.x.array[:size], u[:size], mode[:size]]
     places, *fields = (np.concatenate(comm.allgather(part.reshape(-1, 3))) for part in parts)
-    owners = [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(old)]
     off = mirror.beyond(places) > 1e-9
     S = mirror.reflection
     x = np.concatenate([places, mirror.image(places[off])])
@@ -320,7 +319,7 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T  # from the new frame to the old one
     wanted = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
     values, at_nodes = np.hstack(both), np.zeros((len(wanted), 6))
-    for inside, own in zip(owners, nodes_of_shells(new), strict=True):  # shells that touch are near each other
+    for inside, own in of_shells(old, new):
         if own.any():
             from_own = np.concatenate([inside, inside[off]])
             at_nodes[own] = through(x[from_own], values[from_own], wanted[own])

@@ -1,5 +1,6 @@
 """Transfer of displacements between scenes with the same kind of model, as an initial guess."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,10 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
         moved = stretch.turn(_interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted)
     else:
         scale = system.length / source.model.system.length
-        moved = np.asarray(scale * _interpolated(nodes, values, wanted, np.inf))
+        moved = np.zeros((len(wanted), values.shape[1]))
+        for inside, own in of_shells(source, target):
+            if own.any():
+                moved[own] = scale * _interpolated(nodes[inside], values[inside], wanted[own], np.inf)
     return system.held(moved.ravel())
 
 
@@ -144,6 +148,16 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
         rims.append(shape.circles[0])
         edges.append(shape.radius)
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
+
+
+def of_shells(source: Scene, target: Scene) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Of each shell, which of all nodes of a scene are its own, and which of this rank's nodes of another one.
+
+    Shells that touch are near each other, and move in different ways. Collective.
+    """
+    comm = source.model.system.comm
+    of_all = [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(source)]
+    return zip(of_all, nodes_of_shells(target), strict=True)
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
