@@ -97,7 +97,7 @@ def _changed(case: Case, key: str, value: Any) -> Case:
     replaced: Case = _replaced(case, key, value)
     if written is None:
         return replaced
-    data = _written(written, key, value)  # which the next change builds on
+    data = _written(case, written, key, value)  # which the next change builds on
     if key.startswith("shell."):  # no other number is one that others are given over
         other = _validated(data, case, key)
         replaced = replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
@@ -108,9 +108,9 @@ def _of_data(case: Case, key: str, value: Any) -> Case:
     """A case of several shells with another value, from its data."""
     if case.origin.data is None:
         raise CaseError(f"{key}: needs a case that was read from a file or a mapping: see Case.from_source")
-    data = _written(case.origin.data, key, value)
+    data = _written(case, case.origin.data, key, value)
     tolerance = case.mesh.tolerance
-    bare = _written(data, "mesh.tolerance", None) if tolerance else data  # what it chooses is no mistake
+    bare = _written(case, data, "mesh.tolerance", None) if tolerance else data  # what it chooses is no mistake
     made = _validated(bare, case, key).with_terms(case.own_terms)
     kept = {name: getattr(case, name) for name in type(case).model_fields if name not in OF_SHELLS}
     kept["mesh"] = made.mesh.model_copy(update={"tolerance": tolerance})
@@ -122,8 +122,8 @@ def _of_data(case: Case, key: str, value: Any) -> Case:
     return again.written_as(replace(case.origin, data=data))
 
 
-def _written(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Plain data with another value, in the unit that the one before had."""
+def _written(case: Case, data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Plain data of a case with another value, in the unit that the one before had."""
     changed = deepcopy(dict(data))
     *path, last = key.split(".")
     part: Any = changed
@@ -131,9 +131,29 @@ def _written(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
         part = part[int(name)] if isinstance(part, list) else part.setdefault(name, {})
     at: Any = int(last) if isinstance(part, list) else last
     before = part[at] if isinstance(part, list) else part.get(at)
-    unit = number_and_unit(before)[1] if isinstance(before, str) else ""
-    part[at] = f"{value / si_size(unit)!r} {unit}" if unit and value is not None else value
+    number, unit = number_and_unit(before) if isinstance(before, str) else ("", "")
+    if not unit or value is None:
+        part[at] = value
+        return changed
+    size, held = si_size(unit), _held(case, key)
+    if held and float(number):  # over h or a width, an imperfection is no number in SI units
+        size = held / float(number)
+    elif held is not None:
+        part[at] = f"1 {unit}"
+        size = _held(_validated(changed, case, key), key) or size
+    part[at] = f"{value / size!r} {unit}"
     return changed
+
+
+def _held(case: Case, key: str) -> float | None:
+    """The number of a case at a key, in the size that it has there; None if it has none."""
+    part: Any = case
+    for name in key.split("."):
+        if isinstance(part, list):
+            part = part[int(name)]
+        else:
+            part = part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+    return part if isinstance(part, float) else None
 
 
 def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:

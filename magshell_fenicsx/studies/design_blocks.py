@@ -1,7 +1,7 @@
 """What may vary in a design: numbers of the case, vectors of the remanence, scalar fields."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.input.section import si_size
+from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.simulate.scene import Scene
@@ -174,38 +175,64 @@ class Between(Bounded):
     ----------
     length
         R in the unit of the case's formulas, of a curvature.
+    shells
+        Of several: the place of each, and its thickness over h.
     """
 
     controls: Controls
     length: float = 1.0
+    shells: Mapping[str, tuple[Place, float]] = field(default_factory=dict)
 
     def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
         if not isinstance(by := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         places = by.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
         forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
+        if self.name == "thickness" and self.shells:
+            forces = forces * self._of_own(scene, by.forces.shape[:2])
         comm = by.field.function_space.mesh.comm
         pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
         unit = scene.problem.material.h if self.name == "deviation" else 1.0
         return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
 
     def put(self, data: dict[str, Any], x: Array) -> None:
-        texts = [self._formula(values) for values in self.values(x).T]
-        if self.name == "thickness":
-            data["shell"]["thickness_factor"] = texts[0]
-        elif self.name == "deviation":
-            shell = data["shell"]
-            defect = [shell.pop("defect")] if shell.get("defect") else []
-            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), {"kind": "formula", "w0": texts[0]}]
-        else:
+        values = self.values(x).T
+        if self.name == "curvature":
+            texts = [self._formula(each, self.controls, self.length) for each in values]
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
+            return
+        alone = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
+        of_several = {name: (data["shells"][name]["shell"], *self._own(*own)) for name, own in self.shells.items()}
+        for shell, controls, ratio in (alone | of_several).values():
+            if self.name == "thickness":
+                shell["thickness_factor"] = self._formula(values[0], controls)
+                continue
+            defect = [shell.pop("defect")] if shell.get("defect") else []
+            new = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
+            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), new]
 
-    def _formula(self, values: Array) -> str:
-        R = self.length if self.name == "curvature" else 1.0  # other formulas are of places over R
+    def _own(self, place: Place, ratio: float) -> tuple[Controls, float]:
+        """The points in the frame of one of several shells, over its own length."""
+        at = self.controls.places
+        x = place.own(np.insert(at, 1, 0.0, axis=1) if self.controls.around else at)
+        own = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
+        return Controls(own, self.controls.width / place.scale), ratio
+
+    def _of_own(self, scene: Scene, shape: tuple[int, ...]) -> Array:
+        """What the thickness over h changes by (nodes of cells, 1) with the factor of each one's own shell."""
+        surface = scene.model.meridian if scene.model.axisymmetric else scene.model.midsurface
+        assert surface
+        ratios = np.ones(shape)
+        for name, (_, ratio) in self.shells.items():
+            ratios[surface.patches[name][: shape[0]]] = ratio
+        return ratios.reshape(-1, 1)
+
+    def _formula(self, values: Array, controls: Controls, R: float = 1.0) -> str:
+        """Of places, over R but for a curvature."""
         if np.ptp(values) == 0:
             return repr(float(values[0] / R))
-        below = repr(float(self.controls.width * R) ** 2)
-        weights = [f"exp(-({self._square(place * R)})/{below})" for place in self.controls.places]
+        below = repr(float(controls.width * R) ** 2)
+        weights = [f"exp(-({self._square(place * R)})/{below})" for place in controls.places]
         parts = (f"{float(v / R)!r}*{w}" for v, w in zip(values, weights, strict=True))
         return f"({' + '.join(parts)})/({' + '.join(weights)})"
 

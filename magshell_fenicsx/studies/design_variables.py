@@ -184,10 +184,15 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
 
 def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
     """The scalar fields with their points and values at the start."""
-    fields, problem = [], case.problem()
+    fields, problem, several = [], case.problem(), case.several
+    shells = {part.name: (several.place(part), several.ratio(part)) for part in several.parts} if several else {}
     for name, section in design.fields.items():
         places, width = _spread(case, problem, section.points, section.filter)
-        if name == "thickness":
+        varies = [part.name for part in several.parts if part.case.thickness_factor is not None] if several else []
+        if name == "thickness" and varies:
+            raise CaseError(f"design.thickness: starts even: leave out shells.{varies[0]}.shell.thickness_factor")
+        start: Array
+        if name == "thickness":  # that of several shells is 1 but for their patches
             start = (problem.thickness or Thickness()).at(places)[:, None]
         elif name == "curvature":
             start = _curvatures(problem, places)
@@ -200,7 +205,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
                 f"{high:g}"
             )
         at = places[:, [0, 2]] if problem.meridian else places
-        fields.append(Between(name, np.asarray(start), (low, high), Controls(at, width), case.shell.reference))
+        fields.append(Between(name, np.asarray(start), (low, high), Controls(at, width), case.shell.reference, shells))
     return tuple(fields)
 
 

@@ -6,6 +6,7 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.opened import changed
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 
 R, H, NU = 25.2, 0.28, 0.5
@@ -86,3 +87,21 @@ def test_the_defect() -> None:
         [f"shell={{{SPHERE}, defect: {{kind: dimple, amplitude: {H} mm, width: {WIDTH} mm}}}}"],
     ).imperfections.values()
     assert found.model_dump(include={"amplitude", "width"}) == pytest.approx({"amplitude": 1, "width": 1})
+
+
+@pytest.mark.parametrize("written", [f"{2 * H} mm", "0 mm", "2"])
+@pytest.mark.parametrize("several", [False, True])
+def test_other_numbers_of_what_has_a_unit(several: bool, written: str) -> None:
+    """As derivatives take them: over h, and in widths, whatever the case has written."""
+    flaw = {"kind": "gaussian", "amplitude": float(written) if written == "2" else written, "width": f"{3 * WIDTH} mm"}
+    shell = {"geometry": "cap", "radius": f"{R} mm", "thickness": f"{H} mm", "poisson_ratio": NU, "polar": 60}
+    one = {"shell": {**shell, "imperfections": [flaw]}, "boundary": {"rim": "clamped"}}
+    above = {"shell": shell, "boundary": {"rim": "clamped"}, "place": {"position": [0, 0, "5 mm"]}}
+    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.01}
+    case = ms.Case.from_source(({"shells": {"a": one, "b": above}} if several else one) | {"loading": loading})
+    key = ("shells.a." if several else "") + "shell.imperfections.0."
+    other = changed(case, {f"{key}amplitude": 1.5, f"{key}width": 2.0})
+    assert other.origin.data is not None
+    for each in (other, ms.Case.from_source(other.origin.data)):
+        section = (each.shells["a"] if several and each.shells else each).shell.imperfections[0]
+        assert (section.amplitude, section.width) == pytest.approx((1.5, 2.0), rel=1e-12)

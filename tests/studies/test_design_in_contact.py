@@ -1,12 +1,20 @@
-"""A design whose field changes the gap between shells that touch."""
+"""Designs of several shells: a field that changes the gap between those that touch, and fields of all of them."""
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from command import magshell
+from mpi4py import MPI
 from sheets import Sheet, write
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.studies.design_evaluation import Evaluation, evaluate
+from magshell_fenicsx.studies.design_variables import variables
 
 h = 0.02
 
@@ -39,3 +47,43 @@ def test_thickness_of_two_strips(tmp_path: Path) -> None:
     assert content["best"]["tip_uz"] > 0.98 * content["start"]["tip_uz"]
     assert content["best"]["mass"] == pytest.approx(1, abs=1e-6)
     assert content["verified"]["tip_uz"] == pytest.approx(content["best"]["tip_uz"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "change"), [("thickness", [0.5, 2], [0, 0.05, 0.1, 0.15]), ("deviation", [-1, 1], [0, 0, 0, 0])]
+)
+def test_fields_of_unlike_shells(field: str, values: list[float], change: list[float], tmp_path: Path) -> None:
+    """A strip, and a thicker and shorter one that is turned: results by a random change of a field, by differences."""
+    strip = {"geometry": "strip", "width": 0.2, "poisson_ratio": 0, "youngs_modulus": "1 MPa"}
+
+    def of(length: float, thickness: float, **place: object) -> dict[str, object]:
+        shell = {**strip, "radius": f"{length} mm", "thickness": f"{thickness} mm"}
+        return {"shell": shell, "boundary": {"root": "clamped"}, "points": {"tip": [f"{length} mm", 0, 0]}, **place}
+
+    turned = {"place": {"position": ["3 mm", "5 mm", "8 mm"], "axis": {"polar": 40, "azimuth": 70}}}
+    loads = [{"at": f"{name}_tip", "force": [0, 0, "-1e-5 N"]} for name in ("long", "short")]
+    case = {
+        "shells": {"long": of(50, 1), "short": of(35, 1.4, **turned)},
+        "mesh": {"degree": 3, "size": "20 mm"},
+        "loading": {"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": loads},
+        "design": {
+            "objective": {"maximise": "short_tip_uz"}, field: {"points": 4, "values": values},
+            "constraints": [{"of": "long_tip_uz", "least": -9}],
+        },
+    }  # fmt: skip
+    (tmp_path / "strips.yaml").write_text(yaml.safe_dump(case))
+    source = read_source(tmp_path / "strips.yaml")
+    made = Case.from_source(source)
+    assert made.design
+    vary, standing = variables(source, made, made.design, Case.from_source), Standing()
+    start = vary.first + change
+    way, results = np.random.default_rng(0).standard_normal(len(start)), ["long_tip_uz", "short_tip_uz"]
+
+    def at(c: float) -> Evaluation:
+        there = vary.case_of(start + c * way, tmp_path / "B.csv")
+        return evaluate(there, start, vary, results, {}, MPI.COMM_WORLD, standing)
+
+    here, (further, back) = at(0.0), (at(1e-3), at(-1e-3))
+    for result in results:
+        expected = (further.values[result] - back.values[result]) / 2e-3
+        assert np.array(here.gradients[result]) @ way == pytest.approx(expected, rel=1e-5)

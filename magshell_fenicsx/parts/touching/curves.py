@@ -11,7 +11,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.touching.facing import ALIKE
-from magshell_fenicsx.parts.touching.nearest import BULGE
+from magshell_fenicsx.parts.touching.nearest import BETWEEN_PLACES, BULGE
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 
 Array = NDArray[np.float64]
@@ -176,12 +176,15 @@ class Curves:
         The same.
     beside
         (cells, 2): the cell beyond each end; -1 where there is none.
+    lebesgue
+        See `nearest.highest`.
     """
 
     def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
         self.element, self.nodes, self._r0, self._h = element, nodes, r0, h
         self.beside = beside(nodes)
         self._start = np.linspace(0.0, 1.0, START * element.degree + 1, dtype=np.float64)
+        self.lebesgue = BETWEEN_PLACES * float(np.abs(self.table(0, self._start)[0]).sum(axis=1).max())
 
     def table(self, order: int, X: Array) -> Array:
         """Shape functions and derivatives (order + 1, n, functions); basix takes no empty X."""

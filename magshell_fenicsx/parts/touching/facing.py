@@ -23,6 +23,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     Longs,
     Places,
     Undeformed,
+    highest,
     jets,
     near_pairs,
     places_near,
@@ -71,7 +72,7 @@ class Facing:
         self._cells, self._rule, self._allowed, self._h = cells, rule, allowed, h
         self._r0, self._faces, self._comm = r0, faces, comm
         self.half: Array = faces.undeformed if faces else np.full(len(r0), h / 2)  # undeformed, at all nodes
-        self._thickest = 2 * float(self.half.max())
+        self._thickest = 2 * highest(self.half[cells.nodes], cells.lebesgue)
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._undeformed = np.column_stack([r0, self.half])
         self._known: tuple[Points, Array] = rule, self.x_of(rule, self._undeformed)
@@ -181,7 +182,8 @@ class Facing:
 
     def places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
         """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
-        of_faces, reach = reach, reach + 2 * float(r[:, 3:].max(initial=0.0))
+        thicker = highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
+        of_faces, reach = reach, reach + 2 * thicker
         i, j = self._near_cells(u, reach)
         order, cell_of = points.by_cell
         first = np.searchsorted(cell_of, i)

@@ -33,6 +33,7 @@ LATTICES = (
     4,
     12,
 )  # parts of the sides of cells, between which the search for the nearest place begins: coarse, then fine
+BETWEEN_PLACES = 1.05  # of a sum of shape functions at places of a lattice, that everywhere
 STRIP = 500  # vertices from which ways are searched together
 FOLLOWING = 2  # Newton's steps after a small change
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -109,6 +110,11 @@ class Cells:
         """Places (m, 2) spread over the reference cell, and the shape functions there; coarse ones and fine ones."""
         spread = [np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n for n in LATTICES]
         return [(X, self.element.tabulate(0, X)[0, :, :, 0]) for X in spread]
+
+    @cached_property
+    def lebesgue(self) -> float:
+        """See `highest`."""
+        return BETWEEN_PLACES * float(np.abs(self.lattices[-1][1]).sum(axis=1).max())
 
     @cached_property
     def at_corners(self) -> Array:
@@ -215,6 +221,12 @@ class Undeformed:
     r: Array
     x: Array
     apart: float
+
+
+def highest(values: Array, lebesgue: float) -> float:
+    """A bound of polynomials with values (cells, functions) at nodes; Lebesgue's constant is that of the element."""
+    most, least = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
+    return float(((most + least + lebesgue * (most - least)) / 2).max(initial=-np.inf))
 
 
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:

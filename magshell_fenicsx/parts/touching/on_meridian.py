@@ -29,7 +29,7 @@ from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Close, Curves, Faced, distances, nowhere, slopes
 from magshell_fenicsx.parts.touching.facing import STEEP
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
-from magshell_fenicsx.parts.touching.nearest import FOLLOWING
+from magshell_fenicsx.parts.touching.nearest import FOLLOWING, highest
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH
 
@@ -326,7 +326,8 @@ class MeridianTouching(ContactTerm):
         a point at most."""
         r = self._placed(u, faces=faces)
         x, nodal = self._x_of(r), r[self._nodes]
-        point, cell = self._close(x[:, :2], nodal[..., :2], of_faces + 2 * float(r[:, 2].max()))
+        thicker = highest(nodal[..., 2], self._curves.lebesgue)
+        point, cell = self._close(x[:, :2], nodal[..., :2], of_faces + 2 * thicker)
         if not len(point):
             return nowhere()
         at = self._curves.projected(x, nodal, point, cell)

@@ -259,6 +259,22 @@ def test_two_caps_are_one_on_a_plane(factor: str, top: float) -> None:
 
 
 @pytest.mark.slow
+def test_ridges_that_are_highest_between_nodes() -> None:
+    """Discs 2 h apart, with ridges of 1.8 h: faces of mid-surfaces in space 0.2 h apart."""
+    ridge = "1 + 0.8*exp(-((x**2 + y**2) - 0.09)**2/0.0036)"
+    disc = {"geometry": "disc", "radius": "1 m", "thickness": "0.03 m", "youngs_modulus": "1 Pa", "poisson_ratio": 0.3}
+    shells = {
+        name: {"shell": disc | {"thickness_factor": ridge}, "boundary": {"rim": "clamped"}} | place
+        for name, place in (("lower", {}), ("upper", {"place": {"position": [0, 0, "0.06 m"]}}))
+    }
+    loading = PRESSURE | {"pressure": "1 mPa", "on": "upper"}
+    data = {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": "0.05 m"}, "loading": loading}
+    scene = Scene(Case.from_source(data))
+    (touching,) = scene.model.touchings
+    assert scene.model.axisymmetric
+    assert scene.model.system.at(scene.unloaded()).of(touching.least_gap) == pytest.approx(0.2 * 0.03, rel=1e-2)
+
+
 def test_a_wave_that_comes_and_goes_in_contact() -> None:
     """Pressed domes tilt (m = 1) in a window with a point of the path, where 100 loads find it on this mesh."""
     dome = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.015, "poisson_ratio": 0.3}

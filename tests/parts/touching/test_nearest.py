@@ -6,7 +6,7 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.touching.nearest import Cells, places_near
+from magshell_fenicsx.parts.touching.nearest import Cells, highest, places_near
 
 COUNT = 60
 ELEMENT = basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 3, basix.LagrangeVariant.gll_warped)
@@ -41,3 +41,15 @@ def test_nearest_in_cells(parts: int) -> None:
         assert at.distance[n] < best.fun + 1e-9
         for way in at.free[n].T:
             assert distance(at.X[n] + 1e-6 * way) == pytest.approx(distance(at.X[n] - 1e-6 * way), abs=1e-12)
+
+
+def test_a_bound_of_polynomials() -> None:
+    """Between nodes they may be larger than there; against the largest of many places."""
+    cells = Cells(ELEMENT, np.zeros((1, 10), dtype=np.int64), np.zeros((1, 3), dtype=np.int64))
+    X = np.random.default_rng(1).dirichlet(np.ones(3), 20000)[:, :2]
+    values = np.random.default_rng(2).normal(size=(COUNT, len(ELEMENT.points)))
+    largest = (values @ ELEMENT.tabulate(0, X)[0, :, :, 0].T).max(axis=1)
+    bounds = [highest(each[None], cells.lebesgue) for each in values]
+    assert (bounds >= largest).all()
+    assert (largest > values.max(axis=1) + 0.1).any()
+    assert highest(np.full((2, 10), 0.7), cells.lebesgue) == pytest.approx(0.7)
