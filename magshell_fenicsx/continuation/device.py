@@ -236,13 +236,8 @@ class HeldAlong:
     """A system with one more amplitude, a force along b."""
 
     def __init__(self, system: System, b: Vector) -> None:
-        self.comm, self.size, self.length, self.coordinates = (
-            system.comm,
-            system.size,
-            system.length,
-            system.coordinates,
-        )
-        self._system, self._b = system, b
+        self.comm, self.size, self.length = system.comm, system.size, system.length
+        self.coordinates, self._system, self._b = system.coordinates, system, b
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         return self._system.residual(u, mu) + mu[FORCE] * self._b

@@ -24,15 +24,10 @@ from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
-BESIDE = (
-    4.8  # thicknesses of the way along sides of cells to what a point cannot touch: that is at most 1.2 times as long
-)
+BESIDE = 4.8  # thicknesses of the way along sides to what a point cannot touch; it is at most 1.2 times as long
 BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
 BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
-LATTICES = (
-    4,
-    12,
-)  # parts of the sides of cells, between which the search for the nearest place begins: coarse, then fine
+LATTICES = 4, 12  # parts of a cell's sides, between which the search for the nearest place begins: coarse, then fine
 BETWEEN_PLACES = 1.05  # of a sum of shape functions at places of a lattice, that everywhere
 STRIP = 500  # vertices from which ways are searched together
 FOLLOWING = 2  # Newton's steps after a small change
