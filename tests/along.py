@@ -10,8 +10,11 @@ import pytest
 import scipy.sparse
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx import Scene
+from magshell_fenicsx.assembly.coupled import times
 from magshell_fenicsx.assembly.kernels import JIT_OPTIONS
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
@@ -94,3 +97,23 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -
     Kv = K @ v
     free = np.setdiff1d(np.arange(u.size), system._fixed)
     assert np.linalg.norm((Kv - rate)[free]) <= 1e-6 * np.linalg.norm(Kv)
+
+
+def check_derivatives(
+    scene: Scene, flat: NDArray[np.float64], deep: tuple[float, float], h: float, seed: int = 0
+) -> None:
+    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds."""
+    system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
+    rough, moved, other = (
+        system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
+    )
+    u, v = system.held(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
+    at = system.at(State(u, mu))
+    entries = at.of(term.entries)
+    assert deep[0] < at.of(term.penetration) < deep[1]
+    Kv = times([(1.0, entries)], v)
+    low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
+    assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
+    energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
+    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
+    assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)

@@ -190,7 +190,7 @@ class Linearised:
     ) -> None:
         """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`.
 
-        `rough` is that of its `Iterates`.
+        See `Iterates` for `rough`.
         """
         self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
         self._computed = list[float]()  # steps with computed forces

@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from along import csr
+from along import check_derivatives, csr
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.coupled import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.gap import SOFT
 
@@ -126,21 +125,9 @@ def flattened(scene: Scene) -> Array:
 def test_derivatives() -> None:
     """Of a tube that is pressed flat and stretched, at rough states: differences of energy and forces, 1e-6."""
     scene = ring()
-    system, (term,), mu, flat = scene.model.system, scene.model.touchings, scene.unloaded().mu, flattened(scene)
+    flat = flattened(scene)
     for seed in range(2):
-        rough, moved, other = (
-            system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
-        )
-        u, v = system.held(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
-        at = system.at(State(u, mu))
-        entries = at.of(term.entries)
-        assert 0.05 * h < at.of(term.penetration) < 0.3 * h
-        Kv = times([(1.0, entries)], v)
-        low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
-        assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
-        energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
-        assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
-        assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)
+        check_derivatives(scene, flat, (0.05 * h, 0.3 * h), h, seed)
 
 
 def test_derivatives_by_the_natural_stretch() -> None:

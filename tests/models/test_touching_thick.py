@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from along import csr
+from along import check_derivatives, csr
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.coupled import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.gap import SOFT
 
@@ -112,17 +111,4 @@ def test_derivatives(law: dict[str, Any], flat: tuple[float, ...]) -> None:
     """Of a tube that is pressed flat, also of rubber, at a rough state: differences of energy and forces, 1e-6."""
     shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
     scene = ring(shell=shell | {"poisson_ratio": 0, "thickness_factor": "1 + 0.5*x + 0.1*y"} | law)
-    system, (term,), mu, start = scene.model.system, scene.model.touchings, scene.unloaded().mu, flattened(scene, *flat)
-    rough, moved, other = (
-        system.held(np.random.default_rng([0, k]).standard_normal(start.size)[: system.size]) for k in range(3)
-    )
-    u, v = system.held(start.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
-    at = system.at(State(u, mu))
-    entries = at.of(term.entries)
-    assert 0.01 * h < at.of(term.penetration) < 0.3 * h
-    Kv = times([(1.0, entries)], v)
-    low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
-    assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
-    energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
-    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
-    assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)
+    check_derivatives(scene, flattened(scene, *flat), (0.01 * h, 0.3 * h), h)

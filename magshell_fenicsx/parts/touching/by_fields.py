@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter
-from magshell_fenicsx.parts.touching.faces import Faces, slope_of
+from magshell_fenicsx.parts.touching.faces import Faces, on_nodes, slope_of
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.segments import Points
 
@@ -100,8 +100,8 @@ class Present:
         return np.column_stack([w, self.faces.change(self.u, w)]) if self.faces else w
 
     def on_nodes(self, forces: Array) -> Array:
-        """The forces (nodes, 3) by the displacement, of those by place and thickness."""
-        return np.asarray(forces[:, :3] + (self.faces.slope(self.u, forces[:, 3]) if self.faces else 0.0))
+        """See `faces.on_nodes`."""
+        return on_nodes(self.faces, self.u, forces)
 
     def deeper(self, w: Array) -> Array:
         """What penetrations of joined places change by along w (nodes, 3)."""

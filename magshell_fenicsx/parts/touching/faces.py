@@ -304,6 +304,11 @@ def hessians(
     return np.asarray(H)
 
 
+def on_nodes(faces: Faces | None, u: Array, forces: Array) -> Array:
+    """The forces (nodes, 3) by the displacement, of those by place and thickness, at the displacement u (nodes, 3)."""
+    return np.asarray(forces[:, :3] + (faces.slope(u, forces[:, 3]) if faces else 0.0))
+
+
 def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int) -> Entries:
     """What the Hessian of joined places has besides those of each.
 

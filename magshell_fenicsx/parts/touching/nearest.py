@@ -200,7 +200,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Undeformed:
-    """What tells which pairs of points and places are near each other within the undeformed surface.
+    """Which pairs of points and places are near each other within the undeformed surface.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place, with_growth
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, on_nodes, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number, of_each
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
@@ -170,8 +170,7 @@ class Touching(ContactTerm):
         return Present(*of_all, places, joined, pressed, self._forces(), *found)
 
     def _on_nodes(self, forces: Array) -> Array:
-        """The forces (nodes, 3) by the displacement, of those by place and thickness."""
-        return forces[:, :3] + (self._faces.slope(self._at, forces[:, 3]) if self._faces else 0.0)
+        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 3) of this rank's points; collective."""
