@@ -267,7 +267,7 @@ def test_ridges_that_are_highest_between_nodes() -> None:
         name: {"shell": disc | {"thickness_factor": ridge}, "boundary": {"rim": "clamped"}} | place
         for name, place in (("lower", {}), ("upper", {"place": {"position": [0, 0, "0.06 m"]}}))
     }
-    loading = PRESSURE | {"pressure": "1 mPa", "on": "upper"}
+    loading = PRESSURE | {"pressure": "1 mPa", "on": {"upper": "outside"}}
     data = {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": "0.05 m"}, "loading": loading}
     scene = Scene(Case.from_source(data))
     (touching,) = scene.model.touchings
