@@ -255,15 +255,24 @@ class Facing:
             (cells, 3) where the cuts were made.
         """
         first = at.firsts
-        nearest = at.of(first)
+        on_edge, steep = self._at_edges(points, nearest := at.of(first), normals)
+        left = on_edge & steep & ~points.on_edge[nearest.point]
+        return np.asarray(np.repeat(left, np.diff([*first, len(at.point)])))
+
+    def press_alone(self, points: Points, nearest: Places, normals: Array) -> Inside:
+        """Which points, given with their nearest places, press on a face whose own points are left to this edge."""
+        on_edge, steep = self._at_edges(points, nearest, normals)
+        return np.asarray(steep & ~on_edge)
+
+    def _at_edges(self, points: Points, nearest: Places, normals: Array) -> tuple[Inside, Inside]:
+        """Which nearest places are on an edge, and which are in a cell that is steep to their point's."""
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         along = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
         on_edge = along & (on_side & (self._cells.across[nearest.cell] < 0)).any(axis=1)
         in_corner = on_side.sum(axis=1) == 2  # where an edge goes on from one cell to another, or turns
         on_edge |= in_corner & (~on_side & self._cells.on_edge[nearest.cell]).any(axis=1)
         level = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
-        left = on_edge & (level < STEEP) & ~points.on_edge[nearest.point]
-        return np.asarray(np.repeat(left, np.diff([*first, len(at.point)])))
+        return np.asarray(on_edge), np.asarray(level < STEEP)
 
 
 def nowhere() -> Places:

@@ -254,15 +254,21 @@ class Touching(ContactTerm):
     def of_cells(self) -> tuple[Array, Array]:
         """The mean pressure over E h/R, and the least gap over R within the reach, of local cells.
 
-        Of ghosts the pressure is zero and the gap the reach. Collective.
+        Where an edge alone presses on a face, half of its points' forces acts on each, as the energy has it. Of ghosts
+        the pressure is zero and the gap the reach. Collective.
         """
         at, joined, (_, first, _) = self._pressed()
         points, (start, count) = self._points, self._local
+        nearest = at.of(joined.first)
+        alone = self._facing.press_alone(points, nearest, self._cuts.points(self.cuts.value, self._now())[1])
+        size = points.weight[nearest.point] * first
+        faced = np.bincount(nearest.cell, size / 2 * alone, len(self._cells.nodes))
+        pushed = self._comm.allreduce(self._in_modelled(faced[:, None])[:, 0])[self._shape.own]
         weight, p, gap = np.ones(count), np.zeros(count), np.full(count, self._far - self._h)
         np.add.at(weight, points.cell - start, points.weight)
         weight[: len(np.unique(points.cell))] -= 1.0
-        pressed = at.point[joined.first]
-        np.add.at(p, points.cell[pressed] - start, points.weight[pressed] * first)
+        p[: len(pushed)] = pushed
+        np.add.at(p, points.cell[nearest.point] - start, size * (1 - alone / 2))
         near = self._facing.found(self._now(), self._far, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         return p / weight, gap
