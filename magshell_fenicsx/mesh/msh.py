@@ -198,7 +198,9 @@ def normals(x: Array) -> Array:
     return np.asarray(x[:, 3:] / np.linalg.norm(x[:, 3:], axis=1)[:, None])
 
 
-def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None) -> PatchMesh:
+def read_msh(
+    file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None, held: Collection[str] = ()
+) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
     Physical groups of surfaces become named patches, those of curves named edges. Triangles whose orientation
@@ -208,9 +210,11 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     ----------
     points
         Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is the pole; of
-        several that are, the pole of one of several shells.
+        several that are, one on no `held` edge, and best the pole of one of several shells.
     mirror
         The plane whose half is read; None for the whole surface.
+    held
+        Names of edges.
 
     Raises
     ------
@@ -223,7 +227,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
         on_alike = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
         others = {name: x for name, x in points.items() if name not in on_alike}
         own = [patch.points[name] for name in map("{}_pole".format, patch.shells) if name in patch.points]
-        return replace(patch, points={**_vertices(patch.nodes, patch.cells, others, file.scale, own), **on_alike})
+        return replace(patch, points={**_vertices(patch, others, file.scale, held, own), **on_alike})
     try:
         patch = _whole(file)
     except MeshError as e:
@@ -231,7 +235,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     if isinstance(mirror, Sector) and patch.feet:
         raise MeshError(f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half")
     patch = cut(patch, mirror) if mirror else patch
-    return replace(patch, points=_vertices(patch.nodes, patch.cells, points, file.scale))
+    return replace(patch, points=_vertices(patch, points, file.scale, held))
 
 
 def _alike(points: Mapping[str, Array], name: str) -> list[str]:
@@ -281,13 +285,19 @@ def cell_count(file: MeshFile) -> int:
 
 
 def _vertices(
-    nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float, own: Sequence[Array] = ()
+    patch: PatchMesh, points: Mapping[str, Array], scale: float, held: Collection[str], own: Sequence[Array] = ()
 ) -> dict[str, Array]:
-    """Named ones, and the highest as "pole": of several that are, one of the poles that shells have of their `own`."""
-    corners = nodes[np.unique(cells[:, :3])]
+    """Named ones, and the highest as "pole": of several that are, a free one, best of the poles that shells have of
+    their `own`."""
+    numbers = np.unique(patch.cells[:, :3])
+    corners = patch.nodes[numbers]
+    on_held = [pairs.ravel() for name, pairs in patch.edges.items() if name in held]
+    free = ~np.isin(numbers, np.concatenate([*on_held, np.zeros(0, dtype=np.int64)]))
     all_of_them = np.array([*corners, *own])
     x, y, z = np.round(all_of_them[:, :3], 9).T
-    vertices = {"pole": all_of_them[np.lexsort((x, y, np.arange(len(x)) >= len(corners), z))[-1]]}
+    is_own = np.arange(len(x)) >= len(corners)
+    is_free = free[scipy.spatial.cKDTree(corners[:, :3]).query(all_of_them[:, :3])[1]]
+    vertices = {"pole": all_of_them[np.lexsort((x, y, is_own, is_free, z))[-1]]}
     for name, x in points.items():
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]

@@ -296,7 +296,8 @@ class Problem:
 
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
-            return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
+            held = [name for name, condition in self.conditions.items() if condition in ("clamped", "hinged")]
+            return replace(read_msh(self.shape, self.points, self.mirror, held), embedding=self.embedding)
         if isinstance(self.shape, PatchMesh):
             return replace(self.shape, embedding=self.embedding)
         if isinstance(self.shape, Grid):

@@ -137,9 +137,10 @@ class ShellSection(ShellKeys, OneShape):
     def _imperfections_with_units(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
-        sizes = [data.get(key) for key in ("radius", "thickness")] if isinstance(data, dict) else [None]
-        if all(type(size) in (int, float) and 0 < size < 1e300 for size in sizes):
-            ratio = f"{sizes[0] / sizes[1]:.12g}"
+        sizes = [data.get(key) for key in ("radius", "thickness")] if isinstance(data, dict) else []
+        plain = [size for size in sizes if isinstance(size, int | float) and size > 0]
+        if len(plain) == 2:
+            ratio = f"{plain[0] / plain[1]:.12g}"
             raise ValueError(f"radius and thickness: give each a unit, or radius_to_thickness: {ratio} in their place")
         cls.note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
         return handler(data)

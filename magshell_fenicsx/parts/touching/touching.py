@@ -262,7 +262,7 @@ class Touching(ContactTerm):
         nearest = at.of(joined.first)
         alone = self._facing.press_alone(points, nearest, self._cuts.points(self.cuts.value, self._now())[1])
         size = points.weight[nearest.point] * first
-        faced = np.bincount(nearest.cell, size / 2 * alone, len(self._cells.nodes))
+        faced = np.bincount(nearest.cell, size / 2 * alone, len(self._cells.nodes)).astype(np.float64)
         pushed = self._comm.allreduce(self._in_modelled(faced[:, None])[:, 0])[self._shape.own]
         weight, p, gap = np.ones(count), np.zeros(count), np.full(count, self._far - self._h)
         np.add.at(weight, points.cell - start, points.weight)
