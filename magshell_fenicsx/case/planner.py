@@ -98,7 +98,6 @@ def make_problem(
     formulas = written(context)
     narrow = [None if each.given.key in smooth else looked_at(each.formulas, drawn) for each in formulas]
     drawn = drawn.looked_at(narrow_places([leaves for leaves in narrow if leaves])) if formulas else drawn
-    drawn = replace(drawn, highest=_seen_at(drawn, case))
     refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     energies = surface_terms(context, terms)
     parts = _left(case, drawn, energies)
@@ -392,19 +391,6 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     elif drawn.highest is not None:
         points["pole"] = drawn.highest
     return points
-
-
-def _seen_at(drawn: Outline, case: Case) -> Array | None:
-    """The highest place, in the chart; of a grid that is held there a free corner."""
-    grid, highest = drawn.grid, drawn.highest
-    if grid is None or highest is None:
-        return highest
-    held = {name for name, condition in case.boundary.conditions().items() if condition in ("clamped", "hinged")}
-    first, second = (
-        [low] if glued else [high, low] for low, high, glued in zip(grid.low, grid.high, grid.glued, strict=True)
-    )
-    corners = [np.array([x, y]) for x in first for y in second]
-    return next((x for x in [highest, *corners] if not held & grid.sides_at(x)), highest)
 
 
 def _chart(x: Array, drawn: Outline, *, half: bool) -> Array:

@@ -50,11 +50,6 @@ class Grid:
         """Chart coordinates (4, 2) of the corners."""
         return np.array([[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])])
 
-    def sides_at(self, x: Array) -> set[str]:
-        """Names of the sides that a place of the chart is on, but glued ones."""
-        ends = (self.low[0], self.high[0], self.low[1], self.high[1])
-        return {name for i, name in enumerate(self.sides) if x[i // 2] == ends[i] and not self.glued[i // 2]}
-
     @property
     def cells(self) -> float:
         """Approximate number of triangles."""
