@@ -36,6 +36,10 @@ MISTAKES = [
         "loading.at.point: A: name it in points, with its place; ",
     ),
     ("bodies={ball: {kind: sphere, radius: 6 mm, at: {polar: 50}}}", "bodies.ball.at.polar: 50 is not on the shell"),
+    (
+        "shell={geometry: disc, radius: 1, thickness: 0.02, poisson_ratio: 0.3}",
+        "shell: radius and thickness: give each a unit, or radius_to_thickness: 50 in their place",
+    ),
     ("shell.thickness=0.5", "cap.yaml:1: shell: give every length and youngs_modulus a unit, or none of them: thick"),
     ("shell.youngs_modulus=1.3 mPa", "shell.youngs_modulus: '1.3 mPa': allowed are 1 Pa to 1e13 Pa (MPa: megapascal"),
     (f"{MAGNET}.polarization=1.2", f'{MAGNET}.polarization: 1.2: needs a unit, for example "60 mT"'),

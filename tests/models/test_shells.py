@@ -48,6 +48,17 @@ def test_far_apart() -> None:
     assert seen["lower_tip_uz"] == pytest.approx(alone["tip_uz"], rel=1e-10)
 
 
+def test_what_is_watched() -> None:
+    """The highest of all vertices is on plates that are level: one that no clamp holds."""
+    plate = {"geometry": "plate", "length": 1, "width": 0.5, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    above = {"shell": plate, "boundary": {"right": "clamped"}, "place": {"position": [0, 0, 0.2]}}
+    shells = {"below": {"shell": plate, "boundary": {"left": "clamped"}}, "above": above}
+    problem = Case.from_source({"shells": shells, "loading": {"kind": "pressure"}, "mesh": {"size": 0.25}}).problem()
+    x, _, z = problem.triangulated().points["pole"][:3]
+    assert x < 1
+    assert z == pytest.approx(0.2)
+
+
 def test_sizes() -> None:
     """One with another radius and thickness is as it is alone; numbers are over R and h of the first: 1e-5."""
     upper = cap(radius=1.5, thickness=0.01) | {"points": {"tip": [0, 0, 1.5]}}
