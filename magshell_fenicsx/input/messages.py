@@ -163,8 +163,9 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     for key in loc:
         if key in NO_KEYS:
             continue
-        if not models and not named and isinstance(key, str) and key not in _at(data, kept, dict):
-            continue  # of a union of values
+        known = models[0].model_fields if len(models) == 1 else ()
+        if len(models) < 2 and not named and isinstance(key, str) and key not in {*known, *_at(data, kept, dict)}:
+            continue  # of a union of values, or of a section and a list of it
         if named:
             kept.append(key)
             named = False
@@ -175,7 +176,7 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
         kept.append(key)
         if isinstance(key, str) and models:
             field = models[0].model_fields.get(key)
-            models = _models(field.annotation) if field else []
+            models = list(dict.fromkeys(_models(field.annotation))) if field else []
             named = _has_names(field)
     return tuple(kept)
 
