@@ -84,8 +84,6 @@ class Members:
 
         with part.naming():
             problem = make_problem(part.case, plane=plane, met=self._met[part.name])
-            if problem.awaited:
-                raise CaseError("shell.imperfections: kind: modes: is of a shell alone: take another kind")
             patch = problem.triangulated()
         place = self._several.place(part)
         turned = replace(place, Q=place.Q @ rotation(problem.azimuth).T)

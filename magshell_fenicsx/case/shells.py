@@ -125,9 +125,15 @@ class Several:
         """A hash of all from which they are made."""
         told = [
             [part.name, part.case.model_dump_json(), part.section.place.model_dump_json(), part.case.outside]
+            + [section.awaited for section in part.case.imperfections.values()]
             for part in self.parts
         ]
         return hashlib.sha256(json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()).hexdigest()
+
+    @property
+    def file(self) -> str:
+        """The name of the mesh file for which they stand."""
+        return f"shells {self.digest[:16]}"
 
     def place(self, part: Part) -> Place:
         """Where a shell is, over the R of the first one."""

@@ -155,9 +155,12 @@ def of_shells(source: Scene, target: Scene) -> Iterator[tuple[NDArray[np.bool_],
 
     Shells that touch are near each other, and move in different ways. Collective.
     """
-    comm = source.model.system.comm
-    of_all = [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(source)]
-    return zip(of_all, nodes_of_shells(target), strict=True)
+    return zip(all_of_shells(source), nodes_of_shells(target), strict=True)
+
+
+def all_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
+    """Which of the nodes of all ranks are of each shell; collective."""
+    return [np.concatenate(scene.comm.allgather(inside)) for inside in nodes_of_shells(scene)]
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:

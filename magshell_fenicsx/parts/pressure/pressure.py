@@ -75,7 +75,7 @@ class PressureSection(PathStep):
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
-        return PressureSection(kind="pressure", control=self.control, hold=self.hold) if last else self
+        return PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on) if last else self
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
