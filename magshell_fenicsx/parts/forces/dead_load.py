@@ -232,29 +232,40 @@ class DeadLoads:
     size
         The sum of their sizes over E h R: of a force its length, of a distributed one that of its integral's
         density.
+    spread
+        Of those that are spread: the density, where it is, and whether it has been divided by how large that is.
+    sizes
+        What `size` is as forms, where it depends on the placement.
     """
 
     entries: Entries
     size: float
+    spread: "Sequence[tuple[Expr, Weighted, bool]]" = ()
+    sizes: "Sequence[ufl.Form]" = ()
 
 
 def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog) -> DeadLoads:
     """The load vector of all but the moments; collective."""
     parts, size = list[Entries](), 0.0
+    everywhere, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
 
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(V.mesh, value)
 
-    def spread(along: Expr, measure: Weighted) -> None:
+    def spread(along: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False) -> None:
         parts.append(entries(V, along, measure, log))
+        everywhere.append((along, measure, total))
+        if not total:
+            sizes.append((constant(strength) if isinstance(strength, float) else strength) * measure)
 
     def spread_pattern(pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False) -> float:
         """The integral of its size."""
         along, whole = on.field(pattern, edge)
-        spread(along, measure)
+        strength = ufl.sqrt(ufl.dot(along, along))
+        spread(along, measure, strength)
         if whole is not None and not part:
             return whole
-        form = log.compile("load size", ufl.sqrt(ufl.dot(along, along)) * measure)
+        form = log.compile("load size", strength * measure)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
     for load in loads:
@@ -268,8 +279,9 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
                 continue
             length = ds.total(V, log)
             force = np.asarray(load.force / length) if load.total else load.force
-            spread(constant(force), ds)
-            size += float(np.linalg.norm(force)) * length
+            strength = float(np.linalg.norm(force))
+            spread(constant(force), ds, strength, total=load.total)
+            size += strength * length
         elif isinstance(load, AreaForce):
             dx = on.area(load.patch)
             if callable(load.force):
@@ -279,7 +291,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
                 along, strength = -constant(load.force) * on.normal, abs(load.force)
             else:
                 along, strength = constant(load.force), float(np.linalg.norm(load.force))
-            spread(along, dx)
+            spread(along, dx, strength)
             size += strength * dx.total(V, log)
         else:
             assert isinstance(load, EdgeMoment | Potential)  # no load vectors
@@ -287,7 +299,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
     for dofs, values in parts:
         np.add.at(vector, dofs, values)
     dofs = np.flatnonzero(vector).astype(np.int32)
-    return DeadLoads((dofs, vector[dofs]), size)
+    return DeadLoads((dofs, vector[dofs]), size, everywhere, sizes)
 
 
 def within(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:

@@ -135,6 +135,8 @@ class Adjoint:
         Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
     slope
         What J is of a room, with its own derivatives by a field.
+    forms
+        As of a `Functional`.
     """
 
     scene: Scene
@@ -148,6 +150,7 @@ class Adjoint:
     scale: str = ""
     left: frozenset[str] = frozenset()
     slope: Slope | None = None
+    forms: Sequence[tuple[FormTerm, float]] = ()
 
     @property
     def size(self) -> float:
@@ -270,6 +273,7 @@ def adjoint(
         gas=with_gas(held),
         scale=scale,
         slope=result.slope,
+        forms=result.forms,
     )
     return with_begins(made, record, begins) if hold is None else made
 
