@@ -1,6 +1,7 @@
 """Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from math import inf
@@ -349,6 +350,19 @@ def refuse_meeting(scene: Scene, state: State, of: str) -> None:
                 f"{of}: has no gradient where shells touch ({pair.words}): where they do changes within far less than "
                 "a difference takes; take differences of runs"
             )
+
+
+@contextmanager
+def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
+    """Contact between shells as polynomials about a state, for what is evaluated beside it; None: as it is."""
+    at = scene.model.system.at(state) if state else None
+    for each in scene.model.touchings if at else ():
+        each.hold(at.of(each.pressed))
+    try:
+        yield
+    finally:
+        for each in scene.model.touchings if at else ():
+            each.hold(None)
 
 
 def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:

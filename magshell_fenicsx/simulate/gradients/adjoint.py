@@ -137,6 +137,8 @@ class Adjoint:
         What J is of a room, with its own derivatives by a field.
     forms
         As of a `Functional`.
+    about
+        The state about which contact between shells is a polynomial at all places; None: about each place's own.
     """
 
     scene: Scene
@@ -151,6 +153,7 @@ class Adjoint:
     left: frozenset[str] = frozenset()
     slope: Slope | None = None
     forms: Sequence[tuple[FormTerm, float]] = ()
+    about: State | None = None
 
     @property
     def size(self) -> float:
