@@ -47,6 +47,8 @@ class Functional:
         e at supports: J is e . R of the residual of all nodes.
     forms
         What else of J depends on the placement: energies, and what they are multiplied by.
+    deflections
+        Name of a point -> what u . n0 there is multiplied by in J.
     slope
         What J is of a room, with its derivatives by a field; then J is no amplitude itself, whatever `by_mu` is.
     """
@@ -59,6 +61,7 @@ class Functional:
     reaction: Vector | None = None
     slope: Slope | None = None
     forms: Sequence[tuple[FormTerm, float]] = ()
+    deflections: Mapping[str, float] = field(default_factory=dict)
 
 
 def functional(scene: Scene, state: State, of: str | Target) -> Functional:
@@ -89,7 +92,8 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         return Functional(value, by_u, potentials={name: -1 / unit}, forms=forms)
     if of in AT_POLE and "pole" in model.normals:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
-        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
+        by_normal = {"pole": -1 / scene.problem.material.h}
+        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u), deflections=by_normal)
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
     for room in SEEN:

@@ -337,7 +337,7 @@ def pressing(scene: Scene, state: State) -> list[Contact]:
 
 
 def refuse_meeting(scene: Scene, state: State, of: str) -> None:
-    """See that no shells touch where a second variation is differentiated; collective.
+    """See that no shells touch where the second variation of a wave is differentiated; collective.
 
     Raises
     ------
@@ -347,8 +347,8 @@ def refuse_meeting(scene: Scene, state: State, of: str) -> None:
     for pair, deep in between(scene, state):
         if deep > 0:
             raise CaseError(
-                f"{of}: has no gradient where shells touch ({pair.words}): where they do changes within far less than "
-                "a difference takes; take differences of runs"
+                f"{of}: has no gradient where shells touch ({pair.words}): take symmetry: half, where a wave is a mode "
+                "as others are, or differences of runs"
             )
 
 

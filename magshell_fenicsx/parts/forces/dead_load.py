@@ -133,16 +133,31 @@ def patch_entries(
 
 def vertex_normal(r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None) -> NDArray[np.float64]:
     """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those of some cells."""
+    _, near, (a1, a2) = _corners(r0, x, beside)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def by_vertex_normal(r0: fem.Function, x: Array, v: Array, beside: Inside | None = None) -> Array:
+    """Derivatives (own cells, nodes, 3) of its component along v by the places of nodes; collective."""
+    table, near, (a1, a2) = _corners(r0, x, beside)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    size = np.linalg.norm(total)
+    p = (v - total * (total @ v) / size**2) / size
+    ways = np.stack([np.cross(a2, p), np.cross(p, a1)]) * near[..., None]
+    return np.asarray(np.einsum("dvk,dcvi->cki", table, ways))
+
+
+def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, Inside, Array]:
+    """Slopes of functions (2, corners, nodes); which corners of own cells are at a vertex, and tangents at all."""
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-    a1, a2 = np.einsum("dvk,cki->dcvi", gradients, nodes)
     near = np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
     near = near if beside is None else near & beside[:owned, None]
-    total = V.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
-    return np.asarray(total / np.linalg.norm(total))
+    return gradients, near, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:

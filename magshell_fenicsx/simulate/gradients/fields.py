@@ -30,7 +30,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
-from magshell_fenicsx.simulate.gradients.shape import following, of_measures, of_widths, rates
+from magshell_fenicsx.simulate.gradients.shape import following, of_measures, of_normals, of_widths, rates
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms, touch_as_in
 from magshell_fenicsx.simulate.transfer import transfer
@@ -105,6 +105,8 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             forces += [slope.by_field] if coefficient == slope.field.name else []
         if model.thin and chosen == "r0" and (by_vertices := of_widths(model, shares, w)) is not None:
             forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+        if chosen == "r0":
+            forces[-1] += of_normals(adjoint, place, first=not number)
         if name == "thickness" and scene.problem.loads.contacts:
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces

@@ -22,8 +22,10 @@ from magshell_fenicsx.assembly.forms import by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.patterns import OfPlacement
+from magshell_fenicsx.parts.forces.dead_load import by_vertex_normal
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place
 
 Array = NDArray[np.float64]
 STEP = 1e-4  # of h: of a node
@@ -60,6 +62,23 @@ def of_widths(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem
         if on_edges and (other := ufl.replace(form, moved)) != form:
             wide.append(Share(FormTerm(share.term.name, other, model.u, model.kernels), share.energy, share.work))
     return summed(wide, x, model.u, w, model.kernels) if wide else None
+
+
+def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
+    """The derivatives (own cells, nodes, 3) by normals at points, along which forces and deflections are; collective."""
+    model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
+    if not isinstance(model, ShellModel):  # on the axis of a meridian they stay
+        return 0.0
+    along = [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
+    for name, force in model.loads.forces.items():
+        energy = place.energy * mu[name] + c.get(name, 0.0)
+        along.append((force.point, model.force_unit * energy, model.force_unit * mu[name]))
+    total: Array | float = 0.0
+    for point, of_u, of_w in along:
+        v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(place.w, point)
+        at = model.midsurface.points[point], v, model.midsurface.beside(point)
+        total = total + by_vertex_normal(model.r0, *at)
+    return total
 
 
 def following(terms: Sequence[FormTerm]) -> list[OfPlacement]:

@@ -201,8 +201,8 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
     rate = 1.0 if of.startswith("omega2") else value / (2 * vibration.value)
     c = rate / len(vibration.modes)
     about = state if any(deep > 0 for _, deep in between(scene, state)) else None
-    if about and any(_wave(mode) for mode in vibration.modes):
-        refuse_meeting(scene, state, of)
+    if about and _wave(vibration.modes[0]) is not None:
+        refuse_meeting(scene, state, f"{of}: {vibration.modes[0].label}")
     away = BESIDE_CONTACT if about else AWAY
     with pressed_as_at(scene, about):
         slopes = [_slopes(scene, state, mode, list(held), away) for mode in vibration.modes]
