@@ -195,9 +195,7 @@ def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     points, normals = scene.model.system.at(state).of(lambda: one._cuts.points(number, one._now()))
     area, its = (_area(one._cells, each._r0, points) for each in (one, same))
     same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
-    solution = other.newton.solve(state, "lambda_m", GivenLoad("lambda_m", state.mu["lambda_m"]))
-    assert solution.converged
-    return solution.state
+    return held_at(other, last, "lambda_m")
 
 
 def agrees(scene: Scene, last: Record, by: str, ends: list[tuple[Scene, State]]) -> None:
@@ -228,17 +226,20 @@ def test_by_fields_of_the_shape() -> None:
 
 @pytest.mark.slow
 def test_ranks(tmp_path: Path) -> None:
-    """A run's section `gradients` on 1 and 2 ranks."""
-    asked = {"gradients": {"of": ["lower_top_uy"], "by": [THICKNESS, "lambda_m"]}, "symmetry": "none"}
-    (tmp_path / "arches.yaml").write_text(yaml.safe_dump(ARCHES | asked))
-    found = list[dict[str, float]]()
+    """A run's section `gradients` on 1 and 2 ranks, of a displacement and a frequency, by numbers and the shape."""
+    asked = {"of": ["lower_top_uy", "omega2_1"], "by": [THICKNESS, "lambda_m", "deviation"]}
+    data = imperfect(ARCHES) | {"gradients": asked, "symmetry": "none"}
+    (tmp_path / "arches.yaml").write_text(yaml.safe_dump(data))
+    found = list[dict[str, dict[str, Any]]]()
     for ranks in (1, 2):
         out = tmp_path / str(ranks)
         done = magshell("run", tmp_path / "arches.yaml", "--no-pictures", "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
-        summary = json.loads((out / "summary.json").read_text())
-        found.append(summary["gradients"]["lower_top_uy"]["numbers"])
-    assert found[1] == pytest.approx(found[0], rel=1e-6)
+        found.append(json.loads((out / "summary.json").read_text())["gradients"])
+    for of in asked["of"]:
+        one, two = (each[of] for each in found)
+        assert two["numbers"] == pytest.approx(one["numbers"], rel=1e-6)
+        assert two["fields"]["deviation"]["alike"] == pytest.approx(one["fields"]["deviation"]["alike"], rel=1e-6)
 
 
 @pytest.mark.parametrize("upper", [{}, {"thickness": h}])
@@ -259,7 +260,11 @@ def held_at(scene: Scene, last: Record, name: str = "w") -> State:
     state = last.point.state
     solution = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     assert solution.converged
-    return solution.state
+    state = solution.state
+    for _ in range(2):  # to rounding, for differences
+        correction = scene.newton.factor_at(state).solve(-scene.model.system.residual(state.u, state.mu))
+        state = State(state.u + correction, state.mu)
+    return state
 
 
 def lowest(scene: Scene, state: State) -> float:
@@ -269,10 +274,7 @@ def lowest(scene: Scene, state: State) -> float:
 
 @pytest.mark.slow
 def test_frequencies_of_two_arches() -> None:
-    """By a modulus, a thickness and a deviation: modes of solutions with the same cuts.
-
-    Steps are so small that no point begins to touch, where the slope jumps.
-    """
+    """By a modulus, a thickness and a deviation: modes of solutions with the same cuts."""
     scene = Scene(Case.from_source(imperfect(ARCHES)))
     last = solved(scene)
     found = gradient(scene, last, of="omega2_2", by=[MODULUS, THICKNESS, "deviation"])
@@ -288,6 +290,6 @@ def test_frequencies_of_two_arches() -> None:
     expected = (at(1e-4, MODULUS, 1.0) - at(-1e-4, MODULUS, 1.0)) / 2e-4
     assert found[MODULUS] == pytest.approx(expected, rel=1e-5)
     expected = (at(1e-6, THICKNESS, 0.025) - at(-1e-6, THICKNESS, 0.025)) / 2e-6
-    assert found[THICKNESS] == pytest.approx(expected, rel=1e-4)
+    assert found[THICKNESS] == pytest.approx(expected, rel=1e-5)
     along = (h * times * even(of_shape.places))[..., None]
-    assert of_shape.along(along) == pytest.approx((at(3e-7) - at(-3e-7)) / 6e-7, rel=1e-4)
+    assert of_shape.along(along) == pytest.approx((at(1e-5) - at(-1e-5)) / 2e-5, rel=3e-4)  # it nearly cancels
