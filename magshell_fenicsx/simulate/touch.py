@@ -355,13 +355,16 @@ def refuse_meeting(scene: Scene, state: State, of: str) -> None:
 @contextmanager
 def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
     """Contact between shells as polynomials about a state, for what is evaluated beside it; None: as it is."""
-    at = scene.model.system.at(state) if state else None
-    for each in scene.model.touchings if at else ():
+    if state is None:
+        yield
+        return
+    at = scene.model.system.at(state)
+    for each in scene.model.touchings:
         each.hold(at.of(each.pressed))
     try:
         yield
     finally:
-        for each in scene.model.touchings if at else ():
+        for each in scene.model.touchings:
             each.hold(None)
 
 

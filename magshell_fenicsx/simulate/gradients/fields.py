@@ -138,8 +138,8 @@ def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Shar
     """What the terms give at a place."""
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
-    of_terms = [(t, factor_of(t.amplitude, mu) if acts else 0.0) for t in _terms(scene, place.state, name)]
-    shares = [Share(t, place.energy * mu_i + c.get(t.amplitude or "", 0.0), mu_i) for t, mu_i in of_terms]
+    of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
+    shares = [Share(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0) for t, m in of_terms]
     shares += _of_parameters(scene, place, name)
     for held in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:  # as many of its unit
         share = -c[held] * scene.model.system.potential(place.state.u, mu, held) / scene.model.load_size[held]
@@ -264,9 +264,9 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
     """The terms with the field as a coefficient; a remanence that is the same everywhere is no field in the model's."""
-    terms = list[Term]()
-    for term in scene.model.system.terms:
-        terms.extend(term.forms if isinstance(term, LinearTerm) else [term])
+    terms: Sequence[Term] = [
+        part for term in scene.model.system.terms for part in (term.forms if isinstance(term, LinearTerm) else [term])
+    ]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         terms = list(magnetic_terms(scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))))

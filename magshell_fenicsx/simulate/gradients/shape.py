@@ -67,7 +67,7 @@ def of_widths(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem
 def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
     """The derivatives (own cells, nodes, 3) by normals at points, along which forces and deflections are."""
     model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
-    if not isinstance(model, ShellModel):  # on the axis of a meridian they stay
+    if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
     along = [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
     for name, force in model.loads.forces.items():
