@@ -264,9 +264,8 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
     """The terms with the field as a coefficient; a remanence that is the same everywhere is no field in the model's."""
-    terms: Sequence[Term] = [
-        part for term in scene.model.system.terms for part in (term.forms if isinstance(term, LinearTerm) else [term])
-    ]
+    parts = ((term.forms if isinstance(term, LinearTerm) else (term,)) for term in scene.model.system.terms)
+    terms: list[Term] = [part for each in parts for part in each]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         terms = list(magnetic_terms(scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))))
