@@ -70,7 +70,7 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
         The displacement of the terms, and the vector along which their residual is taken.
     """
     domain = f.function_space.mesh
-    Q = _broken(f.function_space)
+    Q = broken(f.function_space)
     v, derivatives = ufl.TestFunction(Q), fem.Function(Q)
     for share in shares:
         energy = share.term.form
@@ -89,7 +89,7 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
     return np.asarray(derivatives.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
 
 
-def _broken(V: fem.FunctionSpace) -> fem.FunctionSpace:
+def broken(V: fem.FunctionSpace) -> fem.FunctionSpace:
     """The space, free to jump from cell to cell."""
     element = V.element.basix_element
     if element.discontinuous:

@@ -58,7 +58,8 @@ def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
 class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
-    `linear` says that the energy is linear in u, so that it has no tangent.
+    `linear` says that the energy is linear in u, so that it has no tangent; `over` is an integral that a linear one has
+    been divided by.
 
     A load may have no potential. Then `work`, its virtual work, takes the place of the energy's gradient, and the
     energy is only reported. The derivative of the work is no symmetric form.
@@ -83,8 +84,9 @@ class FormTerm:
         *,
         linear: bool = False,
         work: ufl.Form | None = None,
+        over: ufl.Form | None = None,
     ) -> None:
-        self.name, self.amplitude, self.linear = name, amplitude, linear
+        self.name, self.amplitude, self.linear, self.over = name, amplitude, linear, over
         self.group, self.column = name, ""
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
@@ -235,12 +237,21 @@ class DensityTerm(FormTerm, Generic[Density]):
 
 
 class LinearTerm:
-    """A dead load, Pi(u) = -l . u: `entries` of l at local, owned degrees of freedom."""
+    """A dead load, Pi(u) = -l . u: `entries` of l at local, owned degrees of freedom.
+
+    `forms` are those of its parts that depend on the placement.
+    """
 
     def __init__(
-        self, name: str, dofs: NDArray[np.int32], entries: NDArray[np.float64], u: fem.Function, amplitude: str
+        self,
+        name: str,
+        dofs: NDArray[np.int32],
+        entries: NDArray[np.float64],
+        u: fem.Function,
+        amplitude: str,
+        forms: Sequence[FormTerm] = (),
     ) -> None:
-        self.name, self.amplitude = name, amplitude
+        self.name, self.amplitude, self.forms = name, amplitude, forms
         self.group, self.column = name, ""
         self._dofs, self._entries, self._u = dofs, entries, u
 

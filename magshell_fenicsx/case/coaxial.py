@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.patch import Deviated, MeshError
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.shape.outline import Outline, ground_of
 from magshell_fenicsx.shape.turning import Piece, Span
@@ -77,6 +77,12 @@ class Turned:
         own = self.own(s)
         return self._turned(self.span.normal(np.column_stack([own, 0 * own])))
 
+    def deviation(self, s: Array) -> Array:
+        """w0 (n, 1) of the drawn shell there, over R."""
+        own, drawn = self.own(s), self.span.embedding
+        w0 = drawn.w0(np.column_stack([own, 0 * own])) if isinstance(drawn, Deviated) else 0 * own
+        return np.asarray(self.place.scale * w0[:, None])
+
     def foot(self, x: Array) -> tuple[float, float]:
         """Parameter and azimuth (rad) of the nearest place to one in space."""
         own, _ = self.span.place(self.outline.inverse(self.place.own(np.asarray(x)[:3])))
@@ -101,6 +107,32 @@ class Turned:
     @property
     def _moved(self) -> Array:
         return self.place.position * [0.0, 0.0, 1.0]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Charts (n, 2) of the meridians of all -> places (n, 3)."""
+
+    shells: Sequence[Turned]
+
+    def __call__(self, chart: Array) -> Array:
+        return self._along(chart, "at", 3)
+
+    def normal(self, chart: Array) -> Array:
+        """Outward normals (n, 3) of the perfect shells."""
+        return self._along(chart, "normal", 3)
+
+    def w0(self, chart: Array) -> Array:
+        """The deviations (n,) of the drawn shells, over R."""
+        return self._along(chart, "deviation", 1)[:, 0]
+
+    def _along(self, chart: Array, of: str, size: int) -> Array:
+        s, values = chart[:, 0], np.empty((len(chart), size))
+        begins = [shell.start for shell in self.shells]
+        which = np.searchsorted(begins, s + APART / 2, side="right") - 1
+        for i, shell in enumerate(self.shells):
+            values[which == i] = getattr(shell, of)(s[which == i])
+        return values
 
 
 def meridians(several: "Several") -> Span | str:
@@ -141,14 +173,7 @@ def _alone(part: "Part") -> Problem | str:
 
 
 def _joined(shells: Sequence[Turned]) -> Span:
-    begins = np.array([shell.start for shell in shells])
-
-    def along(chart: Array, of: str) -> Array:
-        s, places = chart[:, 0], np.empty((len(chart), 3))
-        which = np.searchsorted(begins, s + APART / 2, side="right") - 1
-        for i, shell in enumerate(shells):
-            places[which == i] = getattr(shell, of)(s[which == i])
-        return places
+    drawn = Joined(shells)
 
     def place(x: Array) -> tuple[float, float]:
         """Of a node of the triangulation, which has the number of its shell, or of a place (3,)."""
@@ -164,8 +189,8 @@ def _joined(shells: Sequence[Turned]) -> Span:
         shells[-1].end,
         tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.circles),
         tuple(name for piece in pieces for name in piece.names),
-        lambda chart: along(chart, "at"),
-        lambda chart: along(chart, "normal"),
+        drawn,
+        drawn.normal,
         place,
         pieces=pieces,
     )

@@ -87,7 +87,7 @@ class Members:
             patch = problem.triangulated()
         place = self._several.place(part)
         turned = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
-        return Member(part.name, patch, turned, tuple(part.section.points))
+        return Member(part.name, patch, turned, tuple(part.section.points), problem.outward)
 
     def _sector(self, part: "Part", sector: Sector) -> Member:
         """The sector of a shell; one that is upside down has the two planes the other way round."""

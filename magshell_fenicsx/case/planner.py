@@ -178,6 +178,7 @@ def make_problem(
         turns=askew(parts) is None,
         shape=shape,
         embedding=drawn.embedding if span else drawn.placed(shape),
+        normal=None if isinstance(case.shell, MeshSurface) else drawn.normal,
         points=points,
         size=size,
         included=[*included, *(f"own energy: {term.name}" for term in terms)],

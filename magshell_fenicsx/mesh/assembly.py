@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Mirror
 from magshell_fenicsx.mesh.patch import (
+    Deviated,
     Embedding,
     MeshError,
     PatchMesh,
@@ -62,12 +63,16 @@ class Place:
 
 @dataclass(frozen=True)
 class Member:
-    """A shell of an assembly: its name, its own triangulation, its place, and which points of it are named."""
+    """A shell of an assembly: its name, its own triangulation, its place, and which points of it are named.
+
+    `normal` maps its nodes to the normals of the perfect shell, if these are known.
+    """
 
     name: str
     patch: PatchMesh
     place: Place
     points: Sequence[str] = ()
+    normal: Embedding | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class Embedded:
     """Nodes (n, 10) of an assembly -> places (n, 3), by the shell of each."""
 
     embeddings: tuple[tuple[Embedding, int, Place], ...]
+    normals: tuple[Embedding | None, ...] = ()
 
     @property
     def charts(self) -> bool:
@@ -88,6 +94,22 @@ class Embedded:
             if of.any():
                 places[of] = place(embedding(nodes[of, 3 : 3 + size]))
         return places
+
+    def normal(self, nodes: Array) -> Array:
+        """Outward unit normals (n, 3) of the perfect shells; nan where they are not known."""
+        number, normals = np.rint(nodes[:, -1]), np.full((len(nodes), 3), np.nan)
+        for i, (normal, (_, size, place)) in enumerate(zip(self.normals, self.embeddings, strict=True)):
+            if normal and (of := number == i).any():
+                normals[of] = normal(nodes[of, 3 : 3 + size]) @ place.Q.T
+        return normals
+
+    def w0(self, nodes: Array) -> Array:
+        """The deviations (n,) of the drawn shells, over R."""
+        number, w0 = np.rint(nodes[:, -1]), np.zeros(len(nodes))
+        for i, (embedding, size, place) in enumerate(self.embeddings):
+            if isinstance(embedding, Deviated) and (of := number == i).any():
+                w0[of] = place.scale * embedding.w0(nodes[of, 3 : 3 + size])
+        return w0
 
 
 @dataclass(eq=False)
@@ -158,7 +180,7 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
     """
     most = max(member.patch.cells.shape[1] for member in members)
     embeddings = tuple((m.patch.embedding, m.patch.nodes.shape[1], m.place) for m in members)
-    embedding = Embedded(embeddings)
+    embedding = Embedded(embeddings, tuple(m.normal for m in members))
     nodes, cells, one = list[Array](), list[NDArray[np.int64]](), list[NDArray[np.int64]]()
     edges, points, patches = dict[str, NDArray[np.int64]](), dict[str, Array](), dict[str, NDArray[np.bool_]]()
     first, total = 0, sum(len(member.patch.cells) for member in members)

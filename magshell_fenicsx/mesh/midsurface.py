@@ -92,11 +92,16 @@ class Midsurface:
 
     def deviation(self, points: NDArray[np.float64], besides: Sequence[Deviation] = ()) -> NDArray[np.float64] | None:
         """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no imperfections."""
-        chart, embedding = self._charted(points), self._patch.embedding
+        embedding = self._patch.embedding
         if not isinstance(embedding, Deviated):
             return None
-        embedding = replace(embedding, deviations=(*embedding.deviations, *besides))
-        return embedding.w0(chart.reshape(-1, chart.shape[-1])).reshape(chart.shape[:2])
+        return self.at(points, replace(embedding, deviations=(*embedding.deviations, *besides)).w0)
+
+    def at(self, points: NDArray[np.float64], of: Embedding) -> NDArray[np.float64]:
+        """A function of nodes of the triangulation at reference points (q, 2) of each cell, (cells, q, ...)."""
+        chart = self._charted(points)
+        values = of(chart.reshape(-1, chart.shape[-1]))
+        return np.asarray(values.reshape(*chart.shape[:2], *values.shape[1:]))
 
     def reshaped(self, embedding: Embedding) -> PatchMesh:
         """The triangulation with another map to space."""
@@ -113,9 +118,8 @@ class Midsurface:
         return self._field(V, "growth", lambda chart: drawn.along_normal(chart, deviations))
 
     def _field(self, V: fem.FunctionSpace, name: str, of: Embedding) -> fem.Function:
-        chart, function = self._charted(compat.interpolation_points(V)), fem.Function(V, name=name)
-        values = of(chart.reshape(-1, chart.shape[-1]))
-        function.x.array.reshape(-1, 3)[V.dofmap.list] = values.reshape(*chart.shape[:2], 3)
+        function = fem.Function(V, name=name)
+        function.x.array.reshape(-1, 3)[V.dofmap.list] = self.at(compat.interpolation_points(V), of)
         function.x.scatter_forward()
         return function
 

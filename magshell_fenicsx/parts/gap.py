@@ -83,10 +83,15 @@ def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
 
 
 def expanded(s: Array, about: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
-    """Its Taylor polynomial of second order about other penetrations, and the derivatives of that."""
+    """Its Taylor polynomial of third order about other penetrations, and the derivatives of that."""
     value, first, second = penalty(about, k, soft)
-    more = s - about
-    return value + more * (first + more / 2 * second), first + more * second, second
+    more, third = s - about, np.where((about > 0) & (about <= soft), k / soft, 0.0)
+    bend = second + more * third
+    return (
+        value + more * (first + more * (second / 2 + more / 6 * third)),
+        first + more * (second + bend) / 2,
+        bend,
+    )
 
 
 def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:

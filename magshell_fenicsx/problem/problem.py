@@ -144,6 +144,8 @@ class Problem:
     shape, size, points, embedding
         What is triangulated, and how it is put into space. The point "pole" is the one whose
         displacement is reported: the pole, the disc's centre, the strip's tip.
+    normal
+        Chart -> outward unit normals of the perfect surface, of one that has a chart.
     included, left_out
         What the model has and lacks, for people.
     thickness
@@ -189,6 +191,7 @@ class Problem:
     size: Size
     included: list[str]
     left_out: list[str]
+    normal: Embedding | None = None
     turns: bool = False
     thickness: Thickness | None = None
     length: float = 1.0
@@ -236,6 +239,11 @@ class Problem:
     @property
     def half(self) -> bool:
         return self.mirror is not None
+
+    @property
+    def outward(self) -> Embedding | None:
+        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell; None if they are not known."""
+        return self.meridian.normal if self.meridian else getattr(self.embedding, "normal", self.normal)
 
     @property
     def given(self) -> MeshFile | None:

@@ -19,7 +19,7 @@ from magshell_fenicsx.assembly.moving import Lid, Pressed
 from magshell_fenicsx.assembly.parameters import Growing, Parameter, Settable, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
-from magshell_fenicsx.mesh.patch import Deviated, Deviation
+from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
@@ -193,10 +193,10 @@ class MeridianModel(Thin):
         self.energies += self.own_and_contacts(meridian.ends)
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force, self.force_unit, around, self.kernels))
-        self.load_size = {}
+        self.load_size, self.load_sizes = {}, {}
         for name, dead in loads.dead.items():
             if forces(dead):
-                energy, self.load_size[name] = dead_loads(name, dead, around, self.kernels)
+                energy, self.load_size[name], self.load_sizes[name] = dead_loads(name, dead, around, self.kernels)
                 self.energies.append(energy)
             self.energies += factory.dead_energies(name, dead, meridian.ends)
         if assembled:
@@ -276,13 +276,10 @@ class MeridianModel(Thin):
         """What further deviations add to the placement."""
         return self.meridian.growth(self.V, deviations)
 
-    def drawn_deviation(self) -> Array | None:
-        """w0 (cells, nodes) of the drawn shape; None for the perfect one."""
-        embedding = self.meridian.embedding
-        if not isinstance(embedding, Deviated):
-            return None
+    def at_nodes(self, of: Embedding) -> Array:
+        """What a function of charts is at the nodes of each cell, (cells, nodes, ...)."""
         s = self.V.tabulate_dof_coordinates()[:, 0]
-        return np.asarray(embedding.w0(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
+        return np.asarray(of(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
 
     def chart(self) -> Array:
         """Coordinates (n, 1) of the nodes along the meridian."""

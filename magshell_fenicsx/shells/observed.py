@@ -13,7 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameters import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.terms import LinearTerm
+from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Mirror
@@ -50,8 +50,8 @@ class Observed:
         Displacement and placement.
     normals
         n0 (3,) at the named points.
-    loads, load_size
-        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, see `DeadLoads`.
+    loads, load_size, load_sizes
+        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, and its forms, see `DeadLoads`.
     supports
         Name of an edge, point or patch -> what it holds.
     without_potential
@@ -84,6 +84,9 @@ class Observed:
     r0: fem.Function
     loads: Loads
     load_size: dict[str, float]
+    load_sizes: dict[str, Sequence[ufl.Form]]
+    V: fem.FunctionSpace
+    kernels: KernelLog
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
@@ -128,8 +131,19 @@ class Observed:
 
     def load_with(self, name: str, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads of an amplitude, except the moments."""
-        self.load_size[name] = dead.size
-        return LinearTerm(name, *dead.entries, self.u, name)
+        self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
+        one, u = fem.Constant(self.V.mesh, 1.0), self.u
+        forms = [
+            FormTerm(
+                name, -ufl.dot(along, u) * on, u, self.kernels, name, linear=True, over=one * on if total else None
+            )
+            for along, on, total in dead.spread
+        ]
+        return LinearTerm(name, *dead.entries, self.u, name, forms)
+
+    def size_terms(self, name: str) -> list[FormTerm]:
+        """What the size of the loads of an amplitude is, as terms that depend on the placement."""
+        return [FormTerm(f"{name} size", form, self.u, self.kernels) for form in self.load_sizes.get(name, ())]
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """A rigid motion that is left free, as a message; empty if there is none. Collective."""

@@ -21,7 +21,7 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
-from magshell_fenicsx.mesh.patch import Deviation, MeshError
+from magshell_fenicsx.mesh.patch import Deviation, Embedding, MeshError
 from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
@@ -125,7 +125,7 @@ class ShellModel(Thin):
                 cells = topology.size_local + topology.num_ghosts
                 loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
         self.midsurface, self.material, self.degree = midsurface, material, degree
-        self.load_size = {}
+        self.load_size, self.load_sizes = {}, {}
         sides = {name: plane for name, plane in mirror.sides.items() if conditions.get(name) == "symmetry"}
         self.multiplicity = mirror.copies if sides else 1
         self.kernels = KernelLog()
@@ -355,9 +355,9 @@ class ShellModel(Thin):
         """What further deviations add to the placement."""
         return self.midsurface.growth(self.V, deviations)
 
-    def drawn_deviation(self) -> NDArray[np.float64] | None:
-        """w0 (cells, nodes) of the drawn shape; None for the perfect one."""
-        return self.midsurface.deviation(self.V.element.basix_element.points)
+    def at_nodes(self, of: Embedding) -> NDArray[np.float64]:
+        """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes, ...)."""
+        return self.midsurface.at(self.V.element.basix_element.points, of)
 
     def chart(self) -> NDArray[np.float64]:
         """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""

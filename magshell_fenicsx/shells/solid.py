@@ -134,7 +134,7 @@ class SolidModel(Observed):
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])
-        self.load_size, self.contacts = {}, {}
+        self.load_size, self.load_sizes, self.contacts = {}, {}, {}
         for name, force in loads.forces.items():
             patch = outer_patch(body, V, force.point, force.patch, self.kernels)
             self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))

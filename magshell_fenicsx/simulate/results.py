@@ -3,7 +3,7 @@
 The barrier is what a probing force passes: its work from zero, over its largest value, back to zero.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +13,11 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.models.shell.patterns import OfPlacement
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -43,6 +45,10 @@ class Functional:
         c: J contains c Pi.
     reaction
         e at supports: J is e . R of the residual of all nodes.
+    forms
+        What else of J depends on the placement: energies, and what they are multiplied by.
+    deflections
+        Name of a point -> what u . n0 there is multiplied by in J.
     slope
         What J is of a room, with its derivatives by a field; then J is no amplitude itself, whatever `by_mu` is.
     """
@@ -54,6 +60,8 @@ class Functional:
     energy: float = 0.0
     reaction: Vector | None = None
     slope: Slope | None = None
+    forms: Sequence[tuple[FormTerm, float]] = ()
+    deflections: Mapping[str, float] = field(default_factory=dict)
 
 
 def functional(scene: Scene, state: State, of: str | Target) -> Functional:
@@ -80,10 +88,12 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         name, unit = of_loads[of]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
-        return Functional(value, by_u, potentials={name: -1 / unit})
+        forms = [(term, -value / model.load_size[name]) for term in model.size_terms(name)]
+        return Functional(value, by_u, potentials={name: -1 / unit}, forms=forms)
     if of in AT_POLE and "pole" in model.normals:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
-        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
+        by_normal = {"pole": -1 / scene.problem.material.h}
+        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u), deflections=by_normal)
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
     for room in SEEN:
@@ -161,14 +171,17 @@ def _turned(scene: Scene) -> Array:
 
 def offset(scene: Scene, target: Target) -> fem.Function:
     """The displacement that reaches the target, at the nodes of the model."""
-    model, Q = scene.model, rotation(scene.problem.azimuth)
-    offsets = fem.Function(model.V)
-    axes, r0 = model.axes, model.r0.x.array
-    places = np.zeros((np.size(r0) // len(axes), 3))
-    places[:, axes] = np.reshape(r0, (-1, len(axes)))
-    wanted = target(places @ Q) @ Q.T
-    offsets.x.array[:] = (wanted - places)[:, axes].ravel()
-    return offsets
+    axes, Q = scene.model.axes, rotation(scene.problem.azimuth)
+
+    def of(r0: fem.Function) -> OfPlacement:
+        offsets = OfPlacement(r0.function_space, "offset", of)
+        places = np.zeros((np.size(r0.x.array) // len(axes), 3))
+        places[:, axes] = np.reshape(r0.x.array, (-1, len(axes)))
+        wanted = target(places @ Q) @ Q.T
+        offsets.x.array[:] = (wanted - places)[:, axes].ravel()
+        return offsets
+
+    return of(scene.model.r0)
 
 
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
@@ -185,11 +198,14 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     over, away = model.over_area(), offset(scene, target)
     gap, log = system.u - away, model.kernels
     one = fem.Constant(model.V.mesh, 1.0)
-    square = log.compile("misfit", over(ufl.dot(gap, gap)))
+    square = FormTerm("misfit", over(ufl.dot(gap, gap)), system.u, log)
+    whole = FormTerm("area", over(one), system.u, log)
     at = system.at(state)
-    area = at.integral(log.compile("area", over(one)))
+    area = at.integral(whole.energy_form)
     slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
-    return Functional(at.integral(square) / area, np.asarray(at.gradient([slope]) / area))
+    value = at.integral(square.energy_form) / area
+    forms = [(square, 1 / area), (whole, -value / area)]
+    return Functional(value, np.asarray(at.gradient([slope]) / area), forms=forms)
 
 
 def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:

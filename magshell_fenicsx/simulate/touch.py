@@ -1,6 +1,7 @@
 """Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from math import inf
@@ -336,7 +337,7 @@ def pressing(scene: Scene, state: State) -> list[Contact]:
 
 
 def refuse_meeting(scene: Scene, state: State, of: str) -> None:
-    """See that no shells touch where a second variation is differentiated; collective.
+    """See that no shells touch where the second variation of a wave is differentiated; collective.
 
     Raises
     ------
@@ -346,9 +347,25 @@ def refuse_meeting(scene: Scene, state: State, of: str) -> None:
     for pair, deep in between(scene, state):
         if deep > 0:
             raise CaseError(
-                f"{of}: has no gradient where shells touch ({pair.words}): where they do changes within far less than "
-                "a difference takes; take differences of runs"
+                f"{of}: has no gradient where shells touch ({pair.words}): take symmetry: half, where a wave is a mode "
+                "as others are, or differences of runs"
             )
+
+
+@contextmanager
+def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
+    """Contact between shells as polynomials about a state, for what is evaluated beside it; None: as it is."""
+    if state is None:
+        yield
+        return
+    at = scene.model.system.at(state)
+    for each in scene.model.touchings:
+        each.hold(at.of(each.pressed))
+    try:
+        yield
+    finally:
+        for each in scene.model.touchings:
+            each.hold(None)
 
 
 def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:

@@ -332,7 +332,7 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
 def _value(result: Result, name: str) -> float | None:
     """A result of a run: the first instability of a fold's amplitude, excluded modes too."""
     if name == MASS:
-        return mass(result.scene)[0]
+        return mass(result.scene).value
     if name in FOLDS:
         points = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
         size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0

@@ -37,6 +37,7 @@ from magshell_fenicsx.studies.runner import Case
 Array = NDArray[np.float64]
 
 DISTANCE = "largest_distance"
+WITH_MASS = ("thickness", "deviation")  # fields that the mass depends on
 LOWEST = (*FOLDS, *FIRST)  # results that others of their kind may cross
 
 
@@ -98,8 +99,10 @@ def evaluate(
     try:
         for result in results:
             if result == MASS:
-                made.values[result], by_thickness = mass(scene)
-                made.gradients[result] = slope({"thickness": by_thickness} if by_thickness else {})
+                of_mass = mass(scene)
+                by = [name for name in variables.names if name in WITH_MASS or "shell." in name]
+                made.values[result] = of_mass.value
+                made.gradients[result] = slope({name: derivative(of_mass, name) for name in by if of_mass.forms})
                 continue
             if lost and result not in FOLDS:
                 return Evaluation(note=notes[0])

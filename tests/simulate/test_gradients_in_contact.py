@@ -20,10 +20,9 @@ from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Place
-from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
 from magshell_fenicsx.parts.touching.expanded import _area
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.numbers import on_mesh_of
@@ -67,6 +66,7 @@ ARCHES: dict[str, Any] = {
     "mesh": {"size": 0.12, "degree": 2},
     "loading": {"kind": "field", "points": 1},
 }  # fmt: skip
+THICKER = "'thickness': 0.025"
 THICKNESS, MODULUS = "shells.upper.shell.thickness", "shells.lower.shell.youngs_modulus"
 
 
@@ -98,7 +98,7 @@ def by_difference(scene: Scene, data: dict[str, Any], key: str, value: float, of
 
 
 def test_on_meridians() -> None:
-    """By the thickness of one shell, on which the gap and the penalty depend, and by a modulus; frequencies have none.
+    """By the thickness of one shell, on which the gap and the penalty depend, and by a modulus; of a frequency too.
 
     One factorisation for all.
     """
@@ -111,8 +111,12 @@ def test_on_meridians() -> None:
     assert scene.newton.factorisation.count <= before + 1
     for key, value in ((THICKNESS, 0.025), (MODULUS, 1.0)):
         assert found[key] == pytest.approx(by_difference(scene, CAPS, key, value, "lower_top_uz"), rel=1e-6), key
-    with pytest.raises(CaseError, match=r"omega2_1: has no gradient where shells touch \(upper and lower\)"):
+    with pytest.raises(CaseError, match=r"omega2_1: m = 1: has no gradient where shells touch \(upper and lower\)"):
         gradient(scene, last, of="omega2_1", by="w")
+    found = gradient(scene, last, of="omega2_2", by=[MODULUS])
+    ahead, back = (Scene(on_mesh_of(scene, case(CAPS, {MODULUS: 1 + c}).problem())) for c in (1e-3, -1e-3))
+    expected = (lowest(ahead, held_at(ahead, last)) - lowest(back, held_at(back, last))) / 2e-3
+    assert found[MODULUS] == pytest.approx(expected, rel=2e-5)
 
 
 def with_remanence(scene: Scene, along: Callable[[Array], Array], c: float) -> Scene:
@@ -168,27 +172,20 @@ def thicker(scene: Scene, c: float) -> Scene:
     return Scene(replace(scene.problem, thickness=replace(given, patches=patches)))
 
 
-def deviated(scene: Scene, c: float, monkeypatch: pytest.MonkeyPatch) -> Scene:
-    """The scene with another shape on the same mesh: both shells moved along their normals."""
-    surface = Meridian if scene.model.axisymmetric else Midsurface
-    drawn = surface.placement
-
-    def placement(self: Any, V: Any) -> Any:
-        r0 = drawn(self, V)
-        x = r0.x.array.reshape(-1, V.dofmap.bs)
-        x += c * h * even(x)[:, None] * outward(x)
-        return r0
-
-    with monkeypatch.context() as patch:
-        patch.setattr(surface, "placement", placement)
-        return Scene(scene.problem)
+def deviated(scene: Scene, c: float, data: dict[str, Any]) -> Scene:
+    """A new case on the same mesh: both shells deviate more, along their normals."""
+    return Scene(on_mesh_of(scene, Case.from_source(imperfect(data, c)).problem()))
 
 
-def outward(x: Array) -> Array:
-    """In the plane of the first two components from the axis, or centre, of the shell that a place belongs to."""
-    off = x - np.where(x[:, 1] < 1 + GAP / 3, 0.0, 2 + GAP)[:, None] * np.eye(x.shape[1])[1]
-    off[:, 2:] = 0
-    return np.asarray(off / np.linalg.norm(off, axis=1)[:, None])
+def imperfect(data: dict[str, Any], c: float = 0.0) -> dict[str, Any]:
+    """With deviations that are zero where the shells touch but for c, and a thickness that follows from them."""
+    data = deepcopy(data)
+    x, square = ("x", "x**2 + y**2") if "magnetic" in data else ("sqrt(x**2 + y**2)", "x**2 + y**2 + z**2")
+    for each in data["shells"].values():
+        flaws = [f"0.5*cos(5*{x}) - 0.5", f"{c!r}*cos(3*{x})"]
+        each["shell"] |= {"imperfections": [{"kind": "formula", "w0": w0} for w0 in flaws]}
+    data["shells"]["lower"]["shell"]["thickness_factor"] = f"1.5 - 0.5*({square})"
+    return data
 
 
 def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
@@ -198,9 +195,7 @@ def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     points, normals = scene.model.system.at(state).of(lambda: one._cuts.points(number, one._now()))
     area, its = (_area(one._cells, each._r0, points) for each in (one, same))
     same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
-    solution = other.newton.solve(state, "lambda_m", GivenLoad("lambda_m", state.mu["lambda_m"]))
-    assert solution.converged
-    return solution.state
+    return held_at(other, last, "lambda_m")
 
 
 def agrees(scene: Scene, last: Record, by: str, ends: list[tuple[Scene, State]]) -> None:
@@ -209,55 +204,92 @@ def agrees(scene: Scene, last: Record, by: str, ends: list[tuple[Scene, State]])
         found = gradient(scene, last, of=of, by=by)[by]
         assert isinstance(found, FieldGradient)
         upper = found.places[..., 2 if scene.model.axisymmetric else 1] > 1 + GAP / 3
-        times = np.where(upper & (scene.problem.thickness is not None), 1.25, 1.0)
-        along = even(found.places) * (h if by == "deviation" else times)
+        times = np.where(upper & (THICKER in str(scene.problem.document.data)), 1.25, 1.0)
+        along = even(found.places) * times * (h if by == "deviation" else 1.0)
         values = [functional(*each, of).value for each in ends]
         assert found.along(along[..., None]) == pytest.approx((values[0] - values[1]) / (2 * STEP), rel=1e-5), (by, of)
 
 
 @pytest.mark.slow
-def test_by_fields_of_the_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_by_fields_of_the_shape() -> None:
     """By the thickness of both arches, on which the gap depends, and by their place; the lower one is of rubber."""
     data = deepcopy(ARCHES)
     data["shells"]["lower"]["shell"] |= {"law": "neo-hookean", "poisson_ratio": 0.5}
-    scene = Scene(Case.from_source(data))
-    last = solved(scene)
-    assert scene.observe(last.point.state)["contact_force"] > 0.01
-    makes = {"thickness": thicker, "deviation": partial(deviated, monkeypatch=monkeypatch)}
-    for name, make in makes.items():
+    makes = {"thickness": (data, thicker), "deviation": (imperfect(data), partial(deviated, data=data))}
+    for name, (given, make) in makes.items():
+        scene = Scene(Case.from_source(given))
+        last = solved(scene)
+        assert scene.observe(last.point.state)["contact_force"] > 0.01
         ends = [(made, with_same_cuts(scene, last, made)) for made in (make(scene, way * STEP) for way in (1, -1))]
         agrees(scene, last, name, ends)
 
 
 @pytest.mark.slow
 def test_ranks(tmp_path: Path) -> None:
-    """A run's section `gradients` on 1 and 2 ranks."""
-    asked = {"gradients": {"of": ["lower_top_uy"], "by": [THICKNESS, "lambda_m"]}, "symmetry": "none"}
-    (tmp_path / "arches.yaml").write_text(yaml.safe_dump(ARCHES | asked))
-    found = list[dict[str, float]]()
+    """A run's section `gradients` on 1 and 2 ranks, of a displacement and a frequency, by numbers and the shape."""
+    asked = {"of": ["lower_top_uy", "omega2_1"], "by": [THICKNESS, "lambda_m", "deviation"]}
+    data = imperfect(ARCHES) | {"gradients": asked, "symmetry": "none"}
+    (tmp_path / "arches.yaml").write_text(yaml.safe_dump(data))
+    found = list[dict[str, dict[str, Any]]]()
     for ranks in (1, 2):
         out = tmp_path / str(ranks)
         done = magshell("run", tmp_path / "arches.yaml", "--no-pictures", "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
-        summary = json.loads((out / "summary.json").read_text())
-        found.append(summary["gradients"]["lower_top_uy"]["numbers"])
-    assert found[1] == pytest.approx(found[0], rel=1e-6)
+        found.append(json.loads((out / "summary.json").read_text())["gradients"])
+    for of in asked["of"]:
+        one, two = (each[of] for each in found)
+        assert two["numbers"] == pytest.approx(one["numbers"], rel=1e-6)
+        assert two["fields"]["deviation"]["alike"] == pytest.approx(one["fields"]["deviation"]["alike"], rel=1e-6)
 
 
 @pytest.mark.parametrize("upper", [{}, {"thickness": h}])
-def test_by_fields_on_meridians(upper: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_by_fields_on_meridians(upper: dict[str, Any]) -> None:
     """The same of two caps on their meridians, also where the thickness is no field in what was solved."""
     data = deepcopy(CAPS)
     data["shells"]["upper"]["shell"] |= upper
-    scene = Scene(Case.from_source(data))
-    last = solved(scene)
-    state = last.point.state
-    makes = {"thickness": thicker, "deviation": partial(deviated, monkeypatch=monkeypatch)}
-    for name, make in makes.items():
-        ends = list[tuple[Scene, State]]()
-        for way in (1, -1):
-            made = make(scene, way * STEP)
-            solution = made.newton.solve(state, "w", GivenLoad("w", state.mu["w"]))
-            assert solution.converged
-            ends.append((made, solution.state))
+    makes = {"thickness": (data, thicker), "deviation": (imperfect(data), partial(deviated, data=data))}
+    for name, (given, make) in makes.items():
+        scene = Scene(Case.from_source(given))
+        last = solved(scene)
+        ends = [(made, held_at(made, last)) for made in (make(scene, way * STEP) for way in (1, -1))]
         agrees(scene, last, name, ends)
+
+
+def held_at(scene: Scene, last: Record, name: str = "w") -> State:
+    """The equilibrium of another scene at the same load."""
+    state = last.point.state
+    solution = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
+    assert solution.converged
+    state = solution.state
+    for _ in range(2):  # to rounding, for differences
+        correction = scene.newton.factor_at(state).solve(-scene.model.system.residual(state.u, state.mu))
+        state = State(state.u + correction, state.mu)
+    return state
+
+
+def lowest(scene: Scene, state: State) -> float:
+    """The lowest frequency that the model sees itself."""
+    return next(mode.eigenvalue for mode in ShellModes(scene.model).vibrations(state, 6) if not mode.label)
+
+
+@pytest.mark.slow
+def test_frequencies_of_two_arches() -> None:
+    """By a modulus, a thickness and a deviation: modes of solutions with the same cuts."""
+    scene = Scene(Case.from_source(imperfect(ARCHES)))
+    last = solved(scene)
+    found = gradient(scene, last, of="omega2_2", by=[MODULUS, THICKNESS, "deviation"])
+    of_shape = found["deviation"]
+    assert isinstance(of_shape, FieldGradient)
+    times = np.where(of_shape.places[..., 1] > 1 + GAP / 3, 1.25, 1.0)
+
+    def at(change: float, key: str = "", value: float = 0.0) -> float:
+        data = imperfect(ARCHES, 0.0 if key else change)
+        made = Scene(on_mesh_of(scene, case(data, {key: value + change} if key else {}).problem()))
+        return lowest(made, with_same_cuts(scene, last, made))
+
+    expected = (at(1e-4, MODULUS, 1.0) - at(-1e-4, MODULUS, 1.0)) / 2e-4
+    assert found[MODULUS] == pytest.approx(expected, rel=1e-5)
+    expected = (at(1e-6, THICKNESS, 0.025) - at(-1e-6, THICKNESS, 0.025)) / 2e-6
+    assert found[THICKNESS] == pytest.approx(expected, rel=1e-5)
+    along = (h * times * even(of_shape.places))[..., None]
+    assert of_shape.along(along) == pytest.approx((at(1e-5) - at(-1e-5)) / 2e-5, rel=3e-4)  # it nearly cancels

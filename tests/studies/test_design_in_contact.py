@@ -50,7 +50,8 @@ def test_thickness_of_two_strips(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "values", "change"), [("thickness", [0.5, 2], [0, 0.05, 0.1, 0.15]), ("deviation", [-1, 1], [0, 0, 0, 0])]
+    ("field", "values", "change"),
+    [("thickness", [0.5, 2], [0, 0.05, 0.1, 0.15]), ("deviation", [-1, 1], [0.1, -0.2, 0.05, 0.3])],
 )
 def test_fields_of_unlike_shells(field: str, values: list[float], change: list[float], tmp_path: Path) -> None:
     """A strip, and a thicker and shorter one that is turned: results by a random change of a field, by differences."""
@@ -77,7 +78,7 @@ def test_fields_of_unlike_shells(field: str, values: list[float], change: list[f
     assert made.design
     vary, standing = variables(source, made, made.design, Case.from_source), Standing()
     start = vary.first + change
-    way, results = np.random.default_rng(0).standard_normal(len(start)), ["long_tip_uz", "short_tip_uz"]
+    way, results = np.random.default_rng(0).standard_normal(len(start)), ["long_tip_uz", "short_tip_uz", "mass"]
 
     def at(c: float) -> Evaluation:
         there = vary.case_of(start + c * way, tmp_path / "B.csv")

@@ -28,6 +28,14 @@ Pattern = Callable[[Array, Array], Array]
 Inside = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they are within a rim
 
 
+class OfPlacement(fem.Function):  # type: ignore[misc]  # dolfinx has no types
+    """A field that follows from the placement; `again` makes it from another one, which may jump from cell to cell."""
+
+    def __init__(self, V: fem.FunctionSpace, name: str, again: Callable[[fem.Function], fem.Function]) -> None:
+        super().__init__(V, name=name)
+        self.again = again
+
+
 def radial(r0: Array, n0: Array) -> Array:
     """Along the normal."""
     return n0
@@ -229,7 +237,7 @@ def pattern_field(
     name: str = "Br",
     key: str = "magnetic.remanent",
     size: int = 3,
-) -> tuple[fem.Function, float | None]:
+) -> tuple[OfPlacement, float | None]:
     """The pattern in every cell, free to jump from cell to cell, see `shown`; collective.
 
     Parameters
@@ -253,7 +261,7 @@ def pattern_field(
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
     nodes, n0 = places(r0, Q.element.basix_element.points)
-    field = fem.Function(Q, name=name)
+    field = OfPlacement(Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0])
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
     fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
     field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
@@ -272,6 +280,7 @@ def pattern_on_edge(
     """The same field on some facets of the boundary, where alone it is right: the moments are those along them."""
     V = r0.function_space
     field, _ = pattern_field(Nodal(pattern), r0, finer)
+    field.again = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
     Q, topology = field.function_space, V.mesh.topology
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.patch import GivenField, MeshError, refuse_places
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.parameters import OwnMaterial
-from magshell_fenicsx.models.shell.patterns import Carried, cells_of, places
+from magshell_fenicsx.models.shell.patterns import Carried, OfPlacement, cells_of, places
 
 Array = NDArray[np.float64]
 LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
@@ -112,7 +112,11 @@ def thickness_field(
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
         values[inside] = factor.in_cells(some(cells_of(r0), inside)) if isinstance(factor, PlacedFactor) else factor
-    return nodal_thickness(values, nodes, V)
+    refuse_unfit(values, nodes, V.mesh.comm)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
+    field = OfPlacement(Q, "thickness", lambda r: thickness_field(thickness, r, patches))
+    field.x.array[Q.dofmap.list] = values
+    return field
 
 
 def material_field(
@@ -133,21 +137,6 @@ def material_field(
 def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
     """Some of this rank's cells."""
     return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
-
-
-def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Function:
-    """The field with values (cells, nodes) at places (cells, nodes, 3), shape (1,); collective.
-
-    Raises
-    ------
-    MeshError
-        On every rank, if it is not positive somewhere.
-    """
-    refuse_unfit(values, nodes, V.mesh.comm)
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
-    field = fem.Function(Q, name="thickness")
-    field.x.array[Q.dofmap.list] = values
-    return field
 
 
 def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "loading.loads") -> NDArray[np.bool_]:

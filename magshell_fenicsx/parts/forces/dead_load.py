@@ -133,16 +133,31 @@ def patch_entries(
 
 def vertex_normal(r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None) -> NDArray[np.float64]:
     """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those of some cells."""
+    _, near, (a1, a2) = _corners(r0, x, beside)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def by_vertex_normal(r0: fem.Function, x: Array, v: Array, beside: Inside | None = None) -> Array:
+    """Derivatives (own cells, nodes, 3) of its component along v by the places of nodes; collective."""
+    table, near, (a1, a2) = _corners(r0, x, beside)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    size = np.linalg.norm(total)
+    p = (v - total * (total @ v) / size**2) / size
+    ways = np.stack([np.cross(a2, p), np.cross(p, a1)]) * near[..., None]
+    return np.asarray(np.einsum("dvk,dcvi->cki", table, ways))
+
+
+def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, Inside, Array]:
+    """Slopes of functions (2, corners, nodes); which corners of own cells are at a vertex, and tangents at all."""
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-    a1, a2 = np.einsum("dvk,cki->dcvi", gradients, nodes)
     near = np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
     near = near if beside is None else near & beside[:owned, None]
-    total = V.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
-    return np.asarray(total / np.linalg.norm(total))
+    return gradients, near, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
@@ -232,29 +247,40 @@ class DeadLoads:
     size
         The sum of their sizes over E h R: of a force its length, of a distributed one that of its integral's
         density.
+    spread
+        Of those that are spread: the density, where it is, and whether it has been divided by how large that is.
+    sizes
+        What `size` is as forms, where it depends on the placement.
     """
 
     entries: Entries
     size: float
+    spread: "Sequence[tuple[Expr, Weighted, bool]]" = ()
+    sizes: "Sequence[ufl.Form]" = ()
 
 
 def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog) -> DeadLoads:
     """The load vector of all but the moments; collective."""
     parts, size = list[Entries](), 0.0
+    everywhere, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
 
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(V.mesh, value)
 
-    def spread(along: Expr, measure: Weighted) -> None:
+    def spread(along: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False) -> None:
         parts.append(entries(V, along, measure, log))
+        everywhere.append((along, measure, total))
+        if not total:
+            sizes.append((constant(strength) if isinstance(strength, float) else strength) * measure)
 
     def spread_pattern(pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False) -> float:
         """The integral of its size."""
         along, whole = on.field(pattern, edge)
-        spread(along, measure)
+        strength = ufl.sqrt(ufl.dot(along, along))
+        spread(along, measure, strength)
         if whole is not None and not part:
             return whole
-        form = log.compile("load size", ufl.sqrt(ufl.dot(along, along)) * measure)
+        form = log.compile("load size", strength * measure)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
     for load in loads:
@@ -268,8 +294,9 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
                 continue
             length = ds.total(V, log)
             force = np.asarray(load.force / length) if load.total else load.force
-            spread(constant(force), ds)
-            size += float(np.linalg.norm(force)) * length
+            strength = float(np.linalg.norm(force))
+            spread(constant(force), ds, strength, total=load.total)
+            size += strength * length
         elif isinstance(load, AreaForce):
             dx = on.area(load.patch)
             if callable(load.force):
@@ -279,7 +306,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
                 along, strength = -constant(load.force) * on.normal, abs(load.force)
             else:
                 along, strength = constant(load.force), float(np.linalg.norm(load.force))
-            spread(along, dx)
+            spread(along, dx, strength)
             size += strength * dx.total(V, log)
         else:
             assert isinstance(load, EdgeMoment | Potential)  # no load vectors
@@ -287,7 +314,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
     for dofs, values in parts:
         np.add.at(vector, dofs, values)
     dofs = np.flatnonzero(vector).astype(np.int32)
-    return DeadLoads((dofs, vector[dofs]), size)
+    return DeadLoads((dofs, vector[dofs]), size, everywhere, sizes)
 
 
 def within(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:

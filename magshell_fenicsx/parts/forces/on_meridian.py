@@ -29,9 +29,10 @@ class Around:
     meridian: Meridian
     carrier: Carrier
 
-    def end(self, name: str) -> Integral:
-        """Along the undeformed circle of an end."""
-        return lambda f: f * self.carrier.r0[0] * self.carrier.ds(self.meridian.ends[name])
+    def end(self, name: str, *, mean: bool = False) -> Integral:
+        """Along the undeformed circle of an end, or the mean over that."""
+        ds = self.carrier.ds(self.meridian.ends[name])
+        return lambda f: f / (2 * np.pi) * ds if mean else f * self.carrier.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
         """The value at a point on the axis, over 2 pi."""
@@ -54,38 +55,43 @@ class Around:
         return lambda f: over(weight * f)
 
 
-def dead_loads(name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog) -> tuple[Energy, float]:
-    """All except the moments, with an amplitude's name, and the sum of their sizes over E h R.
+def dead_loads(
+    name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog
+) -> tuple[Energy, float, Sequence[ufl.Form]]:
+    """All except the moments, with an amplitude's name; the sum of their sizes over E h R, and its forms.
 
     Vectors are along e3, and points are on the axis.
     """
-    parts, size = list[tuple[Expr, Integral]](), 0.0
+    parts, size, sizes = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form]()
     for load in forces(loads):
         if isinstance(load, PointForce):
             over = on.pole(load.point)
         elif isinstance(load, EdgeForce):
-            over = on.end(load.edge)
+            over = on.end(load.edge, mean=load.total)
         else:
             over = on.area(load)
         if not isinstance(load, PointForce) and callable(load.force):
             along, whole = pattern_field(load.force, on.carrier.r0, FINER)
             parts.append((along, over))
             fitted = whole is not None and isinstance(load, AreaForce) and load.patch is None
-            size += whole if fitted and whole is not None else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
+            per = ufl.sqrt(ufl.dot(along, along))
+            size += whole if fitted and whole is not None else _integral(per, over, log)
+            sizes.append(2 * np.pi * over(per))
             continue
         whole = _whole(over, on, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
             along, strength = -kin.normal(on.carrier.j0) * on.carrier.constant(load.force), abs(load.force)
         else:
-            vector = np.asarray(load.force) / (whole if isinstance(load, EdgeForce) and load.total else 1.0)
+            vector = np.asarray(load.force)
             along, strength = on.carrier.constant(vector), float(np.linalg.norm(vector))
         parts.append((along, over))
         size += strength * whole
+        sizes.append(2 * np.pi * over(on.carrier.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
         return sum((over(-ufl.dot(along, u.r)) for along, over in parts[1:]), parts[0][1](-ufl.dot(parts[0][0], u.r)))
 
-    return Energy(name, energy, name, linear=True), size
+    return Energy(name, energy, name, linear=True), size, sizes
 
 
 def pole_force(name: str, force: Force, unit: float, on: Around, log: KernelLog) -> Energy:

@@ -34,7 +34,14 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
-from magshell_fenicsx.models.shell.patterns import Pattern, by_patch, cells_of_body, places_in_body
+from magshell_fenicsx.models.shell.patterns import (
+    OfPlacement,
+    Pattern,
+    by_patch,
+    cells_of,
+    cells_of_body,
+    places_in_body,
+)
 
 Array = NDArray[np.float64]
 Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | GivenField
@@ -152,7 +159,7 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
     if problems := [text for text in V.mesh.comm.allgather(said) if text]:
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
-    field = fem.Function(Q, name="natural")
+    field = OfPlacement(Q, "natural", lambda r: natural_field(natural, cells_of(r), r.function_space))
     values = _numbers(T, kappa, t)
     if any(getattr(each, "by_formula", False) for each in (natural.stretch, natural.curvature)):
         of = fitted(

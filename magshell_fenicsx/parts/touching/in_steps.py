@@ -190,6 +190,18 @@ class ContactTerm:
         self.stiffness = Number(pair.stiffness)
         self.looks: Sequence[Look] = ()  # see `InSteps`
         self.look: Look | None = None
+        self.held: Any = None  # see `hold`
+        self._about: Any = None
+
+    def hold(self, pressed: Any) -> None:
+        """Take what is pressed at one state for that at all states, see `expanded`; None: no more."""
+        self.held = self._about = None
+        if pressed is not None:
+            self.expand_about(pressed)
+            self.held = pressed
+
+    def expand_about(self, pressed: Any) -> None:
+        raise NotImplementedError
 
     @property
     def history(self) -> dict[str, tuple[Number, float]]:

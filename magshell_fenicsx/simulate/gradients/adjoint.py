@@ -135,6 +135,10 @@ class Adjoint:
         Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
     slope
         What J is of a room, with its own derivatives by a field.
+    forms, deflections
+        As of a `Functional`.
+    about
+        The state about which contact between shells is a polynomial at all places; None: about each place's own.
     """
 
     scene: Scene
@@ -148,6 +152,9 @@ class Adjoint:
     scale: str = ""
     left: frozenset[str] = frozenset()
     slope: Slope | None = None
+    forms: Sequence[tuple[FormTerm, float]] = ()
+    deflections: Mapping[str, float] = field(default_factory=dict)
+    about: State | None = None
 
     @property
     def size(self) -> float:
@@ -270,6 +277,8 @@ def adjoint(
         gas=with_gas(held),
         scale=scale,
         slope=result.slope,
+        forms=result.forms,
+        deflections=result.deflections,
     )
     return with_begins(made, record, begins) if hold is None else made
 

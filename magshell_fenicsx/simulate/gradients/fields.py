@@ -2,8 +2,7 @@
 
 Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its magnitude, the factor
 of the thickness, the natural curvature in the case's frame, and a deviation w0 of the drawn shape along the normal of
-the perfect one. By a deviation what is attached to the material (remanence, thickness, natural shape, dead loads) stays
-with it, and the triangulation stays.
+the perfect one. Of a deviation see `shape`.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,17 +20,17 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.coupled import KnowsFields
 from magshell_fenicsx.assembly.forms import FieldGradient, Share
 from magshell_fenicsx.assembly.forms import by_field as summed
-from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
+from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.shell import patterns
-from magshell_fenicsx.models.shell.patterns import Uniform
+from magshell_fenicsx.models.shell.patterns import OfPlacement, Uniform
 from magshell_fenicsx.models.shell.residual import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
+from magshell_fenicsx.simulate.gradients.shape import following, of_measures, of_normals, of_widths, rates
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms, touch_as_in
 from magshell_fenicsx.simulate.transfer import transfer
@@ -86,43 +85,68 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
 
-    def part(number: int, place: Place) -> tuple[fem.Function, list[Array]]:
-        """The field, and what a place gives, whose state is set."""
+    def part(number: int, place: Place, chosen: str | OfPlacement) -> tuple[fem.Function, list[Array]]:
+        """The field, of a name or itself, and what a place gives, whose state is set."""
         if origin:
             touch_as_in(origin.scene, scene, origin.places[number].state)
-        terms = _terms(scene, place.state, name)
-        f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
-        w = _contracted(scene, place)
-        known = [of for term in knowing if (of := _known(term, place, w, kind.coefficient))]
+        shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
+        coefficient = chosen if isinstance(chosen, str) else chosen.name
+        f = next((c for s in shares for c in s.term.form.coefficients() if c is chosen or c.name == chosen), None)
+        known = [of for term in knowing if (of := _known(term, place, w, coefficient))]
         f = f or next((of for of, _ in known), None)
-        if f is None and slope and slope.field is not None and kind.coefficient == slope.field.name:
+        if f is None and slope and slope.field is not None and coefficient == slope.field.name:
             f = slope.field
-        if f is None or (not model.thin and kind.coefficient != "Br"):
+        if f is None or (not model.thin and coefficient != "Br"):
             raise CaseError(f"{name}: the case has no such field: no result depends on it")
-        c = place.conjugates
-        mu = [(term, factor_of(term.amplitude, place.state.mu)) for term in terms]
-        shares = [Share(t, place.energy * mu_i + c.get(t.amplitude or "", 0.0), mu_i) for t, mu_i in mu]
-        shares += _of_parameters(scene, place, name)
-        if not number:
-            shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
+        if model.thin and chosen == "r0":
+            shares += of_measures(model, shares, w)
         forces = [each for _, each in known] + [summed(shares, f, model.u, w, model.kernels)]
         if slope and slope.by_field is not None and slope.field is not None and not number:
-            forces += [slope.by_field] if kind.coefficient == slope.field.name else []
+            forces += [slope.by_field] if coefficient == slope.field.name else []
+        if model.thin and chosen == "r0" and (by_vertices := of_widths(model, shares, w)) is not None:
+            forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+        if chosen == "r0":
+            forces[-1] += of_normals(adjoint, place, first=not number)
         if name == "thickness" and scene.problem.loads.contacts:
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces
 
-    parts = [
-        model.system.at(place.state).of(partial(part, number, place)) for number, place in enumerate(adjoint.places)
-    ]
-    f = parts[-1][0]
-    forces = np.sum([each for _, of_place in parts for each in of_place], axis=0)
+    def of(chosen: str | OfPlacement) -> tuple[fem.Function, Array]:
+        parts = [
+            model.system.at(place.state).of(partial(part, number, place, chosen))
+            for number, place in enumerate(adjoint.places)
+        ]
+        return parts[-1][0], np.sum([each for _, of_place in parts for each in of_place], axis=0)
+
+    f, forces = of(kind.coefficient)
     places, normals = (v[: len(forces)] for v in places_of(scene, f))
     if name == "deviation":
-        places = _perfect(scene, places, normals)
+        places, normals = _perfect(scene, places, normals)
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
+    if model.thin and name == "deviation":
+        shares = [share for i, place in enumerate(adjoint.places) for share in _shares(adjoint, i, place, name)]
+        for field in following([share.term for share in shares]):
+            if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
+                _, by_rate = of(field)
+                each = (np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals))
+                forces = forces + np.stack(list(each), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
+
+
+def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Share]:
+    """What the terms give at a place."""
+    scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
+    acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
+    of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
+    shares = [Share(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0) for t, m in of_terms]
+    shares += _of_parameters(scene, place, name)
+    for held in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:  # as many of its unit
+        share = -c[held] * scene.model.system.potential(place.state.u, mu, held) / scene.model.load_size[held]
+        shares += [Share(t, share, 0.0) for t in scene.model.size_terms(held)]
+    if not number:
+        shares += [Share(t, c * factor_of(t.amplitude, mu), 0.0) for t, c in (*along(scene, adjoint), *adjoint.forms)]
+    return shares
 
 
 def _known(term: KnowsFields, place: Place, w: fem.Function, name: str) -> tuple[fem.Function, Array] | None:
@@ -240,7 +264,8 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
     """The terms with the field as a coefficient; a remanence that is the same everywhere is no field in the model's."""
-    terms: list[Term] = list(scene.model.system.terms)
+    parts = ((term.forms if isinstance(term, LinearTerm) else (term,)) for term in scene.model.system.terms)
+    terms: list[Term] = [part for each in parts for part in each]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         terms = list(magnetic_terms(scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))))
@@ -270,27 +295,19 @@ def _curvatures(scene: Scene, f: fem.Function, forces: Array, places: Array, nor
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
     """By w0, from those by the place."""
-    axes = scene.model.axes
-    return np.asarray(np.sum(forces * _normals(scene, normals)[..., axes], axis=-1, keepdims=True))
+    return np.asarray(np.sum(forces * normals[..., scene.model.axes], axis=-1, keepdims=True))
 
 
-def _normals(scene: Scene, drawn: Array) -> Array:
-    """The normals of the perfect shell at the nodes of this rank's cells, from those of the drawn one."""
-    model = scene.model
-    if not model.thin or not isinstance(scene.problem.embedding, Deviated):
-        return drawn
-    unit, width = model.growth((lambda x: np.ones(len(x)),)), model.V.dofmap.bs
-    normals = np.zeros_like(drawn)
-    normals[..., model.axes] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
-    return normals
-
-
-def _perfect(scene: Scene, places: Array, normals: Array) -> Array:
-    """The places of the perfect shell that deviations are functions of."""
-    model = scene.model
+def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]:
+    """The places of the perfect shell, of which deviations are functions, and its normals, from the drawn one's."""
+    model, outward = scene.model, scene.problem.outward
     assert model.thin
-    w0 = model.drawn_deviation()
-    return places if w0 is None else places - w0[: len(places), :, None] * _normals(scene, normals)
+    drawn = model.meridian.embedding if model.axisymmetric else scene.problem.embedding
+    if outward:
+        known = model.at_nodes(outward)[: len(normals)]
+        normals = np.where(np.isfinite(known), known, normals)
+    w0 = getattr(drawn, "w0", None)
+    return places if w0 is None else places - model.at_nodes(w0)[: len(places), :, None] * normals, normals
 
 
 FIELDS = {
@@ -302,24 +319,22 @@ FIELDS = {
 }
 
 
-def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
-    """The mass over that of the same shell with the thickness h, and its derivatives by the thickness; collective."""
-    model = scene.model
-    if model.thickness is None:
-        return 1.0, None
-    t, over, log = model.thickness, model.over_area(), model.kernels
-    Q, comm = t.function_space, t.function_space.mesh.comm
-    one = fem.Constant(Q.mesh, 1.0)
-    rho = 1.0 if model.made_of is None else model.made_of[2]
-    area = comm.allreduce(fem.assemble_scalar(log.compile("area", over(rho * one))))
-    value = comm.allreduce(fem.assemble_scalar(log.compile("mass", over(rho * t[0])))) / area
-    forces = fem.Function(Q)
-    fem.assemble_vector(forces.x.array, log.compile("mass by thickness", over(rho * ufl.TestFunction(Q)[0])))
-    forces.x.scatter_reverse(InsertMode.add)
-    cells = Q.mesh.topology.index_map(Q.mesh.topology.dim).size_local
-    density = forces.x.array[Q.dofmap.list[:cells]][..., None] / area
-    places, normals = places_of(scene, t)
-    return float(value), FieldGradient(t, np.asarray(density), places[:cells], normals[:cells])
+def mass(scene: Scene) -> Adjoint:
+    """The mass over that of the same shell with the thickness h."""
+    state = scene.unloaded()
+
+    def of(there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
+        t, over, log, u = there.model.thickness, there.model.over_area(), there.model.kernels, there.model.u
+        if t is None:
+            return 1.0, []
+        rho = fem.Constant(t.function_space.mesh, 1.0) if there.model.made_of is None else there.model.made_of[2]
+        terms = FormTerm("mass", over(rho * t[0]), u, log), FormTerm("area", over(rho * 1.0), u, log)
+        value, area = (scene.comm.allreduce(term.energy()) for term in terms)
+        return value / area, [(terms[0], 1 / area), (terms[1], -value / area**2)]
+
+    value, forms = of(scene)
+    still = Place(state, 0.0 * state.u)
+    return Adjoint(scene, [still], by_itself=lambda there, _: of(there)[0], value=value, forms=forms)
 
 
 def density(scene: Scene, gradient: FieldGradient) -> Array:

@@ -23,6 +23,7 @@ from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import expand
+from magshell_fenicsx.simulate.touch import pressed_as_at
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
@@ -201,9 +202,10 @@ def gradient(
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
     """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number` for `others`."""
     size = adjoint.size
-    if by in FIELDS:
-        of_field = by_field(adjoint, by)
-        return replace(of_field, forces=size * of_field.forces)
-    if by in adjoint.state.mu:
-        return size * by_amplitude(adjoint, by)
-    return size * by_number(adjoint, by, others) + adjoint.value * size_by_number(adjoint, by)
+    with pressed_as_at(adjoint.scene, adjoint.about):
+        if by in FIELDS:
+            of_field = by_field(adjoint, by)
+            return replace(of_field, forces=size * of_field.forces)
+        if by in adjoint.state.mu:
+            return size * by_amplitude(adjoint, by)
+        return size * by_number(adjoint, by, others) + adjoint.value * size_by_number(adjoint, by)

@@ -44,11 +44,11 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import pressing, refuse_meeting, rigid
+from magshell_fenicsx.simulate.touch import between, pressed_as_at, pressing, refuse_meeting, rigid
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
-AWAY = 0.3  # e phi at most, over h
+AWAY, BESIDE_CONTACT = 0.3, 0.003  # e phi at most, over h; where shells touch
 SAME = 1e-4  # squared frequencies closer than this, relative, are one multiple frequency
 
 
@@ -182,7 +182,7 @@ def adjoints_of_vibrations(
     Lost
         If the state has no such vibration.
     CaseError
-        If the mode leaves the symmetry of the model, or a body touches the shell.
+        If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave where shells touch.
     """
     state = rigid(scene, scene.model.system.placed(record.point.state))
     if bodies := pressing(scene, state):
@@ -190,7 +190,6 @@ def adjoints_of_vibrations(
             f"{of}: has no gradient where a body touches the shell ({bodies[0].body}): where it touches changes within "
             "far less than a difference takes; take differences of runs"
         )
-    refuse_meeting(scene, state, of)
     held = held_at(scene, record, state, hold)
     kinds = vibrations(scene, state, of, beside=beside, most=most)
     made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in kinds]
@@ -201,7 +200,12 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
     value = frequency(scene.problem, of, vibration.value)
     rate = 1.0 if of.startswith("omega2") else value / (2 * vibration.value)
     c = rate / len(vibration.modes)
-    slopes = [_slopes(scene, state, mode, list(held)) for mode in vibration.modes]
+    about = state if any(deep > 0 for _, deep in between(scene, state)) else None
+    if about and _wave(vibration.modes[0]) is not None:
+        refuse_meeting(scene, state, f"{of}: {vibration.modes[0].label}")
+    away = BESIDE_CONTACT if about else AWAY
+    with pressed_as_at(scene, about):
+        slopes = [_slopes(scene, state, mode, list(held), away) for mode in vibration.modes]
     by_u = np.sum([s.by_u for s in slopes], axis=0) * c
     by_mu = {name: c * sum(s.by_mu[name] for s in slopes) for name in held}
     # nothing displaces a shell that nothing loads, whatever changes
@@ -211,14 +215,14 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
         if (m := _wave(mode)) is not None:
             directions.append(Direction(mode.vector, m, stiffness=c, inertia=-c * mode.eigenvalue))
             continue
-        step = scene.model.system.step_along(mode.vector, AWAY)
+        step = scene.model.system.step_along(mode.vector, away)
         for way, weight in CENTRAL.items():
             moved = State(state.u + way * step * mode.vector, state.mu)
             places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
     by_itself = lambda there, _: frequency(there.problem, of, vibration.value)  # noqa: E731
     gas = with_gas(held)
-    return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas)
+    return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas, about=about)
 
 
 def _wave(mode: ShellMode) -> int | None:
@@ -227,7 +231,7 @@ def _wave(mode: ShellMode) -> int | None:
     return int(mode.label.removeprefix(WAVE)) if mode.label.startswith(WAVE) else None
 
 
-def _slopes(scene: Scene, state: State, mode: ShellMode, held: list[str]) -> Functional:
+def _slopes(scene: Scene, state: State, mode: ShellMode, held: list[str], away: float) -> Functional:
     """phi . K phi with its derivatives by u and by amplitudes that are unknown."""
     system, phi = scene.model.system, mode.vector
     if (m := _wave(mode)) is not None:
@@ -235,7 +239,7 @@ def _slopes(scene: Scene, state: State, mode: ShellMode, held: list[str]) -> Fun
         return variation(scene.model, state, phi, m, held)
     if mode.label:
         raise CaseError(f"{mode.label}: the vibration leaves the symmetry of the model: take symmetry: none")
-    step, by_u, by_mu = system.step_along(phi, AWAY), np.zeros(system.size), dict.fromkeys(held, 0.0)
+    step, by_u, by_mu = system.step_along(phi, away), np.zeros(system.size), dict.fromkeys(held, 0.0)
     for way, weight in CENTRAL.items():
         u, part = state.u + way * step * phi, weight / step
         K = symmetric_part(system.tangent(u, state.mu))

@@ -1,0 +1,107 @@
+"""Derivatives by the drawn shape beside those by the placement that densities contain.
+
+A case with another deviation has other places and normals, and all that is said by them: remanence, thickness and
+natural shape by formulas, loads per area and length, those on an edge in all, and cells of another width. The
+derivative is the sum of those by the placement r0, by the width of the cells, and by each field f that follows from r0,
+
+    dJ/dw0 = n . (dJ/dr0 + dJ/dx) + dJ/df : df/dw0,
+
+where df/dw0 are differences: f in a cell follows from the nodes of this cell alone, so that a node of all cells is
+moved at once. Cells are as wide as the flat triangles between their vertices x.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.forms import Share, broken
+from magshell_fenicsx.assembly.forms import by_field as summed
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.patterns import OfPlacement
+from magshell_fenicsx.parts.forces.dead_load import by_vertex_normal
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place
+
+Array = NDArray[np.float64]
+STEP = 1e-4  # of h: of a node
+
+
+def of_measures(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function) -> list[Share]:
+    """What terms add that have been divided by an integral over what they act on; collective."""
+    added, comm, v = list[Share](), model.V.mesh.comm, fem.Function(model.V)
+    for share in shares:
+        if share.term.over is None:
+            continue
+        v.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
+        along = model.kernels.compile(f"{share.term.name} along", ufl.replace(share.term.form, {model.u: v}))
+        over = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
+        value, size = (comm.allreduce(each) for each in (fem.assemble_scalar(along), over.energy()))
+        added.append(Share(over, -value / size, 0.0))
+    return added
+
+
+def of_widths(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function) -> Array | None:
+    """The derivatives (cells, vertices, 3) by the vertices of flat cells, whose widths are in energies of edges."""
+    if model.axisymmetric:  # where the placement says how wide they are
+        return None
+    domain = model.V.mesh
+    x = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
+    x.interpolate(lambda places: places)
+    jet, (volume, side) = kin.jet(x, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
+    length = kin.conormal(jet, kin.facet_covector(domain))[2]
+    moved = {volume: volume * kin.area_ratio(jet), side: side * length}
+    wide = list[Share]()
+    for share in shares:
+        form = share.term.form
+        on_edges = any(each.integral_type() != "cell" for each in form.integrals())
+        if on_edges and (other := ufl.replace(form, moved)) != form:
+            wide.append(Share(FormTerm(share.term.name, other, model.u, model.kernels), share.energy, share.work))
+    return summed(wide, x, model.u, w, model.kernels) if wide else None
+
+
+def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
+    """The derivatives (own cells, nodes, 3) by normals at points, along which forces and deflections are."""
+    model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
+    if not model.midsurface:  # on the axis of a meridian they stay
+        return 0.0
+    along = [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
+    for name, force in model.loads.forces.items():
+        energy = place.energy * mu[name] + c.get(name, 0.0)
+        along.append((force.point, model.force_unit * energy, model.force_unit * mu[name]))
+    total: Array | float = 0.0
+    for point, of_u, of_w in along:
+        v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(place.w, point)
+        at = model.midsurface.points[point], v, model.midsurface.beside(point)
+        total = total + by_vertex_normal(model.r0, *at)
+    return total
+
+
+def following(terms: Sequence[FormTerm]) -> list[OfPlacement]:
+    """The fields in terms that follow from the placement."""
+    found = (c for term in terms for c in term.form.coefficients() if isinstance(c, OfPlacement))
+    return list(dict.fromkeys(found))
+
+
+def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array) -> Iterator[Array]:
+    """What a field (own cells, nodes, size) changes by as each node of all cells moves along its normal; collective.
+
+    `normals` (own cells, nodes, 3) are those of own cells.
+    """
+    V, step = model.V, STEP * model.material.h
+    r = fem.Function(broken(V))
+    nodes = r.x.array.reshape(-1, V.dofmap.bs)
+    drawn = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
+    at, dofs = r.function_space.dofmap.list, field.function_space.dofmap.list[: len(normals)]
+    for k in range(drawn.shape[1]):
+        values = list[Array]()
+        for way in (1, -1):
+            moved = drawn.copy()
+            moved[: len(normals), k] += way * step * normals[:, k][:, model.axes]
+            nodes[at] = moved
+            values.append(field.again(r).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs])
+        yield np.asarray((values[0] - values[1]) / (2 * step))
