@@ -1,6 +1,6 @@
 """The meridians of several shells of revolution with one axis, one after the other along one parameter."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Place
+from magshell_fenicsx.mesh.assembly import MEET, Place
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
@@ -89,11 +89,15 @@ class Turned:
         return np.asarray(s if self.upright else s[::-1])
 
     @property
+    def names(self) -> list[str | None]:
+        """Those of its first and last end; None for a pole."""
+        named = [name and f"{self.name}_{name}" for name in self.span.names]
+        return named if self.upright else named[::-1]
+
+    @property
     def piece(self) -> Piece:
         """It as a part of all."""
-        named = [name and f"{self.name}_{name}" for name in self.span.names]
-        first, last = named if self.upright else named[::-1]
-        return Piece(self.name, (self.start, self.end), (first, last), self.foot, self.vertices)
+        return Piece(self.name, (self.start, self.end), self.foot, self.vertices)
 
     def _turned(self, x: Array) -> Array:
         return np.asarray(x if self.upright else x * [1.0, 1.0, -1.0])
@@ -111,9 +115,7 @@ def meridians(several: "Several") -> Span | str:
     CaseError, MeshError
         If a shell alone cannot be built; the message begins with its key.
     """
-    if several.joints:
-        return "joints: shells that are joined are modelled all around"
-    shells, start = list[Turned](), 0.0
+    shells = list[Turned]()
     for part in several.parts:
         place, outline = several.place(part), ground_of(part.case.shell).perfect
         key = part.refused("place")
@@ -123,9 +125,42 @@ def meridians(several: "Several") -> Span | str:
         if isinstance(problem, str):
             return part.refused(problem)
         assert problem.meridian
-        shells.append(Turned(part.name, start, problem, problem.meridian, place, outline))
-        start = shells[-1].end + APART
-    return _joined(shells)
+        shells.append(Turned(part.name, 0.0, problem, problem.meridian, place, outline))
+    after = _after(shells, several.joints)
+    if isinstance(after, str):
+        return after
+    ordered = _in_chains(shells, after)
+    return "joints: shells are joined in a ring" if len(ordered) < len(shells) else _joined(ordered, several)
+
+
+def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[str, str] | str:
+    """Shell -> that which goes on where it ends, joined to it; or why two cannot be joined so."""
+    ends = {name: (shell, end) for shell in shells for end, name in enumerate(shell.names) if name}
+    places = np.vstack([shell.at(np.linspace(shell.start, shell.end, 101)) for shell in shells])
+    after = dict[str, str]()
+    for number, names in enumerate(joints):
+        key = f"joints.{number}.edges"
+        if any(name not in ends for name in names):
+            return f"{key}: an edge on another shell, or none"
+        (last, first), meet = sorted((ends[name] for name in names), key=lambda end: -end[1]), f"{' and '.join(names)}"
+        if (last[1], first[1]) != (1, 0):
+            return f"{key}: the normals of {meet} point to opposite sides"
+        apart = last[0].at(np.array([last[0].end]))[0] - first[0].at(np.array([first[0].start]))[0]
+        if np.linalg.norm(apart) > MEET * np.ptp(places, axis=0).max():
+            return f"{key}: {meet} do not meet"
+        after[last[0].name] = first[0].name
+    return after
+
+
+def _in_chains(shells: Sequence[Turned], after: Mapping[str, str]) -> list[Turned]:
+    """Along the parameter: each followed by that which is joined to its end, with none between."""
+    by_name, ordered, end = {shell.name: shell for shell in shells}, list[Turned](), -APART
+    for name in (shell.name for shell in shells if shell.name not in after.values()):
+        end, of = end + APART, name or None
+        while of:
+            ordered.append(replace(by_name[of], start=end))
+            end, of = ordered[-1].end, after.get(of)
+    return ordered
 
 
 def _alone(part: "Part") -> Problem | str:
@@ -141,12 +176,13 @@ def _alone(part: "Part") -> Problem | str:
     return "shell.imperfections: modes are of a shell alone" if problem.awaited else problem
 
 
-def _joined(shells: Sequence[Turned]) -> Span:
-    begins = np.array([shell.start for shell in shells])
+def _joined(shells: Sequence[Turned], several: "Several") -> Span:
+    joined = {name for names in several.joints for name in names}
+    begins = np.array([shell.start - (0 if shell.names[0] in joined else APART / 2) for shell in shells])
 
     def along(chart: Array, of: str) -> Array:
         s, places = chart[:, 0], np.empty((len(chart), 3))
-        which = np.searchsorted(begins, s + APART / 2, side="right") - 1
+        which = np.searchsorted(begins, s + ROUNDING, side="right") - 1
         for i, shell in enumerate(shells):
             places[which == i] = getattr(shell, of)(s[which == i])
         return places
@@ -154,21 +190,23 @@ def _joined(shells: Sequence[Turned]) -> Span:
     def place(x: Array) -> tuple[float, float]:
         """Of a node of the triangulation, which has the number of its shell, or of a place (3,)."""
         if len(x) > len("xyz"):
-            return shells[round(float(x[-1]))].foot(x)
+            return by_name[several.parts[round(float(x[-1]))].name].foot(x)
         at = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
         feet = [shell.foot(x) for shell in shells]
         away = [np.linalg.norm(shell.at(np.array([s]))[0] - at) for shell, (s, _) in zip(shells, feet, strict=True)]
         return feet[int(np.argmin(away))]
 
-    pieces = tuple(shell.piece for shell in shells)
+    by_name = {shell.name: shell for shell in shells}
+    at = {name: s for shell in shells for name, s in zip(shell.names, (shell.start, shell.end), strict=True) if name}
     span = Span(
         shells[-1].end,
         tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.circles),
-        tuple(name for piece in pieces for name in piece.names),
+        tuple(None if name in joined else name for shell in shells for name in shell.names),
         lambda chart: along(chart, "at"),
         lambda chart: along(chart, "normal"),
         place,
-        pieces=pieces,
+        pieces=tuple(shell.piece for shell in shells),
+        joints=tuple((at[one], at[other]) for one, other in several.joints),
     )
     reach, h = max(1.0, float(span.sample()[:, 0].max())), shells[0].problem.material.h
     waves = max(shell.most_waves for shell in shells)

@@ -22,10 +22,12 @@ from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
+from magshell_fenicsx.models.shell.edges import FOLD
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
@@ -170,7 +172,11 @@ class MeridianModel(Thin):
             shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
         carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, made_of=self.made_of)
+        folded = meridian.largest_fold(self.r0) > FOLD
+        creases = Creases.of(loads.joints, meridian) if loads.joints else None
+        self.factory = factory = EnergyFactory(
+            carrier, self.u, *of_shell, folded, pressed=pressed, creases=creases, made_of=self.made_of
+        )
         around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
