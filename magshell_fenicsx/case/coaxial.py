@@ -95,6 +95,11 @@ class Turned:
         return named if self.upright else named[::-1]
 
     @property
+    def places(self) -> list[tuple[str | None, Array]]:
+        """Their names and places."""
+        return [(name, self.at(np.array([s]))[0]) for name, s in zip(self.names, (self.start, self.end), strict=True)]
+
+    @property
     def piece(self) -> Piece:
         """It as a part of all."""
         return Piece(self.name, (self.start, self.end), self.foot, self.vertices)
@@ -129,27 +134,39 @@ def meridians(several: "Several") -> Span | str:
     after = _after(shells, several.joints)
     if isinstance(after, str):
         return after
-    ordered = _in_chains(shells, after)
+    places = dict(of for shell in shells for of in shell.places)
+    marked = [_marked(shell, [places[foot] for foot, on in several.joints if on == shell.name]) for shell in shells]
+    ordered = _in_chains(marked, after)
     return "joints: shells are joined in a ring" if len(ordered) < len(shells) else _joined(ordered, several)
 
 
 def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[str, str] | str:
     """Shell -> that which goes on where it ends, joined to it; or why two cannot be joined so."""
-    ends = {name: (shell, end) for shell in shells for end, name in enumerate(shell.names) if name}
-    places = np.vstack([shell.at(np.linspace(shell.start, shell.end, 101)) for shell in shells])
+    ends = {name: (end, x, shell) for shell in shells for end, (name, x) in enumerate(shell.places)}
+    along = [shell.at(shell.end * np.arange(101.0) / 100) for shell in shells]
+    extent = np.ptp(np.vstack(along), axis=0).max()
     after = dict[str, str]()
     for number, names in enumerate(joints):
-        key = f"joints.{number}.edges"
+        key, both = f"joints.{number}.edges", " and ".join(names)
+        if names[0] in ends and names[1] in {shell.name for shell in shells}:
+            continue  # of a T-junction
         if any(name not in ends for name in names):
-            return f"{key}: an edge on another shell, or none"
-        (last, first), meet = sorted((ends[name] for name in names), key=lambda end: -end[1]), f"{' and '.join(names)}"
-        if (last[1], first[1]) != (1, 0):
-            return f"{key}: the normals of {meet} point to opposite sides"
-        apart = last[0].at(np.array([last[0].end]))[0] - first[0].at(np.array([first[0].start]))[0]
-        if np.linalg.norm(apart) > MEET * np.ptp(places, axis=0).max():
-            return f"{key}: {meet} do not meet"
-        after[last[0].name] = first[0].name
+            return f"{key}: there is no such edge"
+        (begin, x, after_it), (end, y, before_it) = sorted((ends[name] for name in names), key=lambda end: end[0])
+        if (begin, end) != (0, 1):
+            return f"{key}: the normals of {both} point to opposite sides"
+        if np.linalg.norm(x - y) > MEET * extent:
+            return f"{key}: {both} do not meet"
+        after[before_it.name] = after_it.name
     return after
+
+
+def _marked(shell: Turned, feet: Sequence[Array]) -> Turned:
+    """With cells that end where another shell stands, at places (3,)."""
+    own = [float(shell.own(np.array(shell.foot(x)[0]))) for x in feet]
+    new = [s for s in own if np.abs(shell.span.knots - s).min() > ROUNDING]
+    span = replace(shell.span, circles=(*shell.span.circles, *new))
+    return replace(shell, problem=replace(shell.problem, meridian=span), span=span)
 
 
 def _in_chains(shells: Sequence[Turned], after: Mapping[str, str]) -> list[Turned]:
@@ -177,7 +194,9 @@ def _alone(part: "Part") -> Problem | str:
 
 
 def _joined(shells: Sequence[Turned], several: "Several") -> Span:
-    joined = {name for names in several.joints for name in names}
+    joints, names = several.joints, [part.name for part in several.parts]
+    by_name = {shell.name: shell for shell in shells}
+    joined = {name for one, other in joints if other not in by_name for name in (one, other)}
     begins = np.array([shell.start - (0 if shell.names[0] in joined else APART / 2) for shell in shells])
 
     def along(chart: Array, of: str) -> Array:
@@ -190,14 +209,14 @@ def _joined(shells: Sequence[Turned], several: "Several") -> Span:
     def place(x: Array) -> tuple[float, float]:
         """Of a node of the triangulation, which has the number of its shell, or of a place (3,)."""
         if len(x) > len("xyz"):
-            return by_name[several.parts[round(float(x[-1]))].name].foot(x)
+            return by_name[names[round(float(x[-1]))]].foot(x)
         at = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
         feet = [shell.foot(x) for shell in shells]
         away = [np.linalg.norm(shell.at(np.array([s]))[0] - at) for shell, (s, _) in zip(shells, feet, strict=True)]
         return feet[int(np.argmin(away))]
 
-    by_name = {shell.name: shell for shell in shells}
-    at = {name: s for shell in shells for name, s in zip(shell.names, (shell.start, shell.end), strict=True) if name}
+    at = {name: s for shell in shells for name, s in zip(shell.names, (shell.start, shell.end), strict=True)}
+    places = dict(of for shell in shells for of in shell.places)
     span = Span(
         shells[-1].end,
         tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.circles),
@@ -206,7 +225,9 @@ def _joined(shells: Sequence[Turned], several: "Several") -> Span:
         lambda chart: along(chart, "normal"),
         place,
         pieces=tuple(shell.piece for shell in shells),
-        joints=tuple((at[one], at[other]) for one, other in several.joints),
+        joints=tuple(
+            (at[one], at[other] if other in at else by_name[other].foot(places[one])[0]) for one, other in joints
+        ),
     )
     reach, h = max(1.0, float(span.sample()[:, 0].max())), shells[0].problem.material.h
     waves = max(shell.most_waves for shell in shells)

@@ -42,6 +42,7 @@ from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+    from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
 
@@ -124,8 +125,8 @@ class MeridianModel(Thin):
         h(x)/h, free to jump from cell to cell; None for 1.
     made_of
         Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
-    touchings
-        The contacts of shells with each other.
+    touchings, tees
+        The contacts of shells with each other, and their T-junctions.
     """
 
     touchings: "Sequence[MeridianTouching]"
@@ -231,9 +232,14 @@ class MeridianModel(Thin):
             self.touchings = touchings(loads.pairs, *curves, self.thickness)
         for each in self.touchings:
             stiffnesses |= each.history
+        self.tees: list[MeridianTee] = []
+        if any(of is None for of in meridian.joints):
+            from magshell_fenicsx.shells.tee import tees_of_meridian
+
+            self.tees = tees_of_meridian(self)
         self.system = FiniteElementSystem(
             self.u,
-            [*terms, *self.touchings],
+            [*terms, *self.touchings, *self.tees],
             held,
             pattern,
             self.material.h,
@@ -271,7 +277,7 @@ class MeridianModel(Thin):
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
-        return ExcludedWaves(Waves(*of, self.touchings))
+        return ExcludedWaves(Waves(*of, [*self.touchings, *self.tees]))
 
     @property
     def waves(self) -> Waves:

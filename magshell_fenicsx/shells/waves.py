@@ -33,6 +33,7 @@ from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
@@ -50,7 +51,7 @@ class Waves:
     supports
         What is held.
     touching
-        Contacts, whose entries are not in the pattern of the others.
+        Contacts and T-junctions, whose entries are not in the pattern of the others.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Waves:
         carrier: Carrier,
         supports: Supports,
         log: KernelLog,
-        touching: Sequence[MeridianTouching] = (),
+        touching: Sequence[MeridianTouching | MeridianTee] = (),
     ) -> None:
         self.touching = touching
         degree = system.u.function_space.element.basix_element.degree

@@ -97,7 +97,9 @@ class Meridian:
         """The cells of each shell, or of those that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._ends), dtype=bool)]
         for both in self.tied:
-            parts = [of for of in bodies if (np.abs(np.subtract.outer(both, self._ends[of])) < ROUNDING).any()]
+            begin, end = self._ends[:, :1] - ROUNDING, self._ends[:, 1:] + ROUNDING
+            at = ((begin < both) & (both < end)).any(axis=1)
+            parts = [of for of in bodies if (of & at).any()]
             bodies = [of for of in bodies if all(of is not part for part in parts)] + [np.any(parts, axis=0)]
         return bodies
 
