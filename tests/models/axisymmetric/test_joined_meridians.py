@@ -1,0 +1,141 @@
+"""Joined coaxial shells on their meridians: beams on elastic foundations, a shell cut in two, differences."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Record
+
+NU, THIN, THICK, LENGTH, PRESSURE = 0.3, 1e-4, 2e-4, 0.15, 1e-6
+PRESSED = {"kind": "pressure", "until": "target", "pressure": PRESSURE, "points": 1}
+
+
+def cylinder(z: float, h: float, points: dict[str, Any] | None = None, **keys: Any) -> dict[str, Any]:
+    shell = {"geometry": "cylinder", "radius": 1, "length": LENGTH, "thickness": h}
+    material = {"youngs_modulus": 1, "poisson_ratio": NU}
+    return {"shell": {**shell, **material}, "place": {"position": [0, 0, z]}, "points": points or {}, **keys}
+
+
+def end(data: dict[str, Any]) -> tuple[Scene, Record, dict[str, Any]]:
+    scene = Scene(Case.from_source({"symmetry": "axisymmetric", **data}))
+    *_, last = follow(scene)
+    return scene, last, scene.observe(last.point.state)
+
+
+def beam(h: float) -> tuple[float, float, float]:
+    """Bending stiffness, decay, and the radial displacement under p = 1 of a long cylinder (R = E = 1)."""
+    return h**3 / (12 * (1 - NU**2)), (3 * (1 - NU**2)) ** 0.25 / np.sqrt(h), -1 / h
+
+
+def of_two_cylinders(k: float) -> float:
+    """Where they meet, under p = 1, joined by a spring k: Timoshenko & Woinowsky-Krieger, Plates and Shells, 114.
+
+    With w = delta + exp(-beta x)(A cos beta x + B sin beta x), x away from the joint, w' = beta (B - A),
+    w'' = -2 beta^2 B and w''' = 2 beta^3 (A + B) there; shear and moment are D w''' and D w''.
+    """
+    (D, b, d), (E, c, e) = beam(THIN), beam(THICK)
+    rows = [
+        [1, 0, -1, 0],  # w
+        [D * b**3, D * b**3, E * c**3, E * c**3],  # shear
+        [0, D * b**2, 0, -E * c**2],  # moment
+        [-k * b, k * b + 2 * D * b**2, -k * c, k * c],  # k (w1' + w2') = moment
+    ]
+    A = np.linalg.solve(np.array(rows), [e - d, 0, 0, 0])[0]
+    return float(d + A)
+
+
+@pytest.mark.parametrize("kind", ["rigid", "hinge", "spring"])
+def test_two_cylinders(kind: str) -> None:
+    """Of different thickness, joined, under pressure: where they meet they move as by beam theory, 1e-5."""
+    D, b, _ = beam(THIN)
+    k = {"rigid": 1e6 * D * b, "hinge": 0.0, "spring": D * b}[kind]
+    joint = {"edges": ["low.top", "high.bottom"], "kind": kind, **({"stiffness": k} if kind == "spring" else {})}
+    low = cylinder(0, THIN, {"joint": [1, 0, LENGTH]}, boundary={"bottom": "clamped"})
+    scene, last, seen = end(
+        {"shells": {"low": low, "high": cylinder(LENGTH, THICK)}, "joints": [joint], "loading": PRESSED}
+    )
+    p = PRESSURE * scene.model.material.classical_pressure
+    assert seen["low_joint_ux"] == pytest.approx(p * of_two_cylinders(k), rel=1e-5)
+
+
+def test_a_ring_in_a_cylinder() -> None:
+    """A T-junction: the beam at a point support of a ring by Lamé; what is left is what the tie gives way, 2e-4."""
+    inner = 0.97
+    wall = cylinder(0, THIN, {"foot": [1, 0, LENGTH / 2]}, boundary={"bottom": "clamped"})
+    ring = {"geometry": "annulus", "radius": 1, "inner_radius": inner, "thickness": THICK, "youngs_modulus": 1}
+    rib = {"shell": {**ring, "poisson_ratio": NU}, "place": {"position": [0, 0, LENGTH / 2]}}
+    joints = [{"edges": ["rib.outer", "wall"]}]
+    loading = {**PRESSED, "on": {"wall": "outside"}}
+    scene, _, seen = end({"shells": {"wall": wall, "rib": rib}, "joints": joints, "loading": loading})
+    D, b, d = beam(THIN)
+    of_ring = ((1 - NU) + (1 + NU) * inner**2) / (1 - inner**2) / THICK
+    force = d / (of_ring + 1 / (8 * b**3 * D))
+    p = PRESSURE * scene.model.material.classical_pressure
+    assert seen["wall_foot_ux"] == pytest.approx(p * force * of_ring, rel=2e-4)
+
+
+def cap(**keys: Any) -> dict[str, Any]:
+    shell = {"geometry": "cap", "radius": 1, "thickness": 0.03, "youngs_modulus": 1, "poisson_ratio": 0.3, **keys}
+    return {"shell": shell}
+
+
+def test_a_shell_cut_in_two_is_the_shell() -> None:
+    """It buckles under the same pressure, in the same waves around e3, to 1e-9."""
+    top, low = cap(polar=40), {**cap(polar=80, hole=40), "boundary": {"rim": "clamped"}}
+    loading = {"kind": "pressure", "until": "bifurcation"}
+    cut = {"shells": {"top": top, "low": low}, "joints": [{"edges": ["low.hole", "top.rim"]}]}
+    shell = {**cap(polar=80), "boundary": {"rim": "clamped"}}
+    one, other = (end({**data, "loading": loading, "mesh": {"size": 2 * np.pi / 180}})[1] for data in (cut, shell))
+    assert one.mode == other.mode != "symmetric"
+    assert one.point.state.mu["pressure"] == pytest.approx(other.point.state.mu["pressure"], rel=1e-9)
+
+
+DOME = {**cap(polar=60), "points": {"top": [0, 0, 1]}}
+WALL = {
+    "shell": {
+        "geometry": "cylinder",
+        "radius": np.sqrt(3) / 2,
+        "length": 0.3,
+        "thickness": 0.02,
+        "youngs_modulus": 2,
+        "poisson_ratio": 0.25,
+    },
+    "boundary": {"bottom": "clamped"},
+    "place": {"position": [0, 0, 0.2]},
+}
+RING = {
+    "shell": {
+        "geometry": "annulus",
+        "radius": np.sqrt(3) / 2,
+        "inner_radius": 0.7,
+        "thickness": 0.02,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
+    },
+    "place": {"position": [0, 0, 0.4]},
+}
+
+
+@pytest.mark.parametrize("edges", [["dome.rim", "wall.top"], ["ring.outer", "wall"]], ids=["edges", "tee"])
+def test_derivatives(edges: list[str]) -> None:
+    """Of energy and forces against differences at a rough state; more with a stiffer spring."""
+    shells = {"wall": WALL, "dome": DOME} if edges[0] == "dome.rim" else {"wall": WALL, "ring": RING}
+    products = []
+    for stiffness in (1e-4, 2e-4):
+        joints = [{"edges": edges, "kind": "spring", "stiffness": stiffness}]
+        scene = Scene(Case.from_source({"shells": shells, "joints": joints, "mesh": {"size": 0.1}}))
+        model, mu = scene.model, scene.unloaded().mu
+        assert model.axisymmetric
+        system, rng = model.system, np.random.default_rng(0)
+        u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
+        K = system.tangent(u, mu)
+        x, product = K.createVecs()
+        x.setArray(v)
+        K.mult(x, product)
+        low, high = (system.residual(u + side * 1e-7 * v, mu) for side in (-0.5, 0.5))
+        assert np.abs((high - low) / 1e-7 - product.array).max() < 1e-6 * np.abs(product.array).max()
+        products.append(v @ product.array)
+    assert products[1] > products[0]
