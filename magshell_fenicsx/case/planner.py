@@ -145,8 +145,6 @@ def make_problem(
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     rims = different(local)
-    if case.joints and isinstance(beyond, Sector):
-        raise CaseError(f"symmetry: {case.symmetry}: not with joints: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())

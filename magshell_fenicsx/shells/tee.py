@@ -2,8 +2,8 @@
 
 Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied to the places of
 the other mid-surface at which they are undeformed. So the edge follows the other shell, whose own displacements stay
-free: cells need not meet. Both ties are springs, `TIGHT` times as stiff as an element beside them. With n of the edge's cell
-and m of the other shell, t along the edge, s = t . (n x m) and c = n . m:
+free: cells need not meet. Both ties are springs, `TIGHT` times as stiff as an element beside them. With n of the edge's
+cell and m of the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
 """

@@ -54,7 +54,7 @@ def test_two_cylinders(kind: str) -> None:
     k = {"rigid": 1e6 * D * b, "hinge": 0.0, "spring": D * b}[kind]
     joint = {"edges": ["low.top", "high.bottom"], "kind": kind, **({"stiffness": k} if kind == "spring" else {})}
     low = cylinder(0, THIN, {"joint": [1, 0, LENGTH]}, boundary={"bottom": "clamped"})
-    scene, last, seen = end(
+    scene, _, seen = end(
         {"shells": {"low": low, "high": cylinder(LENGTH, THICK)}, "joints": [joint], "loading": PRESSED}
     )
     p = PRESSURE * scene.model.material.classical_pressure
