@@ -120,6 +120,9 @@ def meridians(several: "Several") -> Span | str:
     CaseError, MeshError
         If a shell alone cannot be built; the message begins with its key.
     """
+    joined = [{several.of(name) for name in names} for names in several.joints]
+    if any(set(pair) in joined for pair in several.pairs):
+        return "contact: shells that are joined to each other are modelled with their circumference"
     shells = list[Turned]()
     for part in several.parts:
         place, outline = several.place(part), ground_of(part.case.shell).perfect

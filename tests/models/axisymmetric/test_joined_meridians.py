@@ -4,8 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 
@@ -139,3 +142,49 @@ def test_derivatives(edges: list[str]) -> None:
         assert np.abs((high - low) / 1e-7 - product.array).max() < 1e-6 * np.abs(product.array).max()
         products.append(v @ product.array)
     assert products[1] > products[0]
+
+
+def test_dome_on_wall() -> None:
+    """The case buckles where a half of both surfaces does with cells of 0.08, at 0.572106: 1e-5."""
+    _, last, _ = end(read_source(CASES / "dome_on_wall.yaml").data)
+    assert last.mode == "m = 5"
+    assert last.point.state.mu["pressure"] == pytest.approx(0.572106, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_half_of_both_surfaces() -> None:
+    """Folded by a spring, then pressed: as a half with cells of 0.12, 2e-5."""
+    case = read_source(CASES / "dome_on_wall.yaml").data
+    joints = [{"edges": ["dome.rim", "wall.top"], "kind": "spring", "stiffness": 1e-5, "angle": -40}]
+    case |= {"joints": joints, "loading": {"kind": "pressure", "until": "target", "pressure": 0.25, "points": 1}}
+    _, _, seen = end(case)
+    _, _, half = end(case | {"symmetry": "half", "mesh": {"size": 0.12}})
+    for key in ("volume_change", "dome_top_uz"):
+        assert seen[key] == pytest.approx(half[key], rel=2e-5)
+
+
+RIM = {"geometry": "annulus", "radius": 1, "inner_radius": 0.8, "thickness": 0.02, "youngs_modulus": 1}
+BOX = {
+    "outer": {**cylinder(0, 0.02), "boundary": {}},
+    "top": {"shell": {**RIM, "poisson_ratio": NU}, "place": {"position": [0, 0, LENGTH]}},
+    "low": {"shell": {**RIM, "poisson_ratio": NU}, "place": {"axis": {"polar": 180}}, "boundary": {"inner": "clamped"}},
+}
+AROUND = [{"edges": ["outer.top", "top.outer"]}, {"edges": ["outer.bottom", "low.outer"]}]
+REFUSED = {
+    "contact": ({"contact": [["outer", "top"]]}, "contact: shells that are joined to each other are modelled with"),
+    "sides": ({"joints": [{"edges": ["outer.top", "low.outer"]}]}, "point to opposite sides"),
+    "apart": ({"joints": [{"edges": ["outer.top", "top.inner"]}]}, "point to opposite sides|do not meet"),
+    "none": ({"joints": [{"edges": ["outer.top", "top.rim"]}]}, "there is no such edge"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_modelled_on_surfaces(name: str) -> None:
+    """What has no meridian says why, and `symmetry: auto` takes surfaces."""
+    keys, message = REFUSED[name]
+    data = {"shells": BOX, "joints": AROUND, **keys}
+    with pytest.raises(CaseError, match=message):
+        make_problem(Case.from_source({**data, "symmetry": "axisymmetric"}))
+    if name == "contact":
+        assert make_problem(Case.from_source({**data, "symmetry": "auto"})).meridian is None
+        assert make_problem(Case.from_source({**data, "contact": []})).meridian
