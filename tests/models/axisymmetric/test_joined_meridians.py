@@ -9,6 +9,7 @@ from conftest import CASES
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 
@@ -96,6 +97,21 @@ def test_a_shell_cut_in_two_is_the_shell() -> None:
     assert one.point.state.mu["pressure"] == pytest.approx(other.point.state.mu["pressure"], rel=1e-9)
 
 
+def test_frequencies_of_a_free_shell_cut_in_two() -> None:
+    """Its rigid motions are those of one body, and its vibrations those of the shell, 1e-5 on coarse cells."""
+    cut = {"shells": {"top": cap(polar=40), "low": cap(polar=80, hole=40)}}
+    cut |= {"joints": [{"edges": ["low.hole", "top.rim"]}]}
+    found = []
+    for data in (cut, cap(polar=80) | {"boundary": {"rim": "free"}}):
+        scene = Scene(Case.from_source({**data, "mesh": {"size": np.pi / 18}, "frequencies": {}}))
+        assert scene.model.axisymmetric
+        found.append(ShellModes(scene.model).vibrations(scene.unloaded(), 6, loose=True))
+    assert [mode.label for mode in found[0]] == [mode.label for mode in found[1]]
+    squares = [np.array([mode.eigenvalue for mode in of]) for of in found]
+    assert not squares[0][:4].any()
+    assert squares[0][4:] == pytest.approx(squares[1][4:], rel=1e-5)
+
+
 DOME = {**cap(polar=60), "points": {"top": [0, 0, 1]}}
 WALL = {
     "shell": {
@@ -170,7 +186,16 @@ BOX = {
     "low": {"shell": {**RIM, "poisson_ratio": NU}, "place": {"axis": {"polar": 180}}, "boundary": {"inner": "clamped"}},
 }
 AROUND = [{"edges": ["outer.top", "top.outer"]}, {"edges": ["outer.bottom", "low.outer"]}]
-REFUSED = {
+TUBE = {"geometry": "torus", "radius": 1, "tube_radius": 0.3, "thickness": 0.02, "youngs_modulus": 1}
+CLOSED = {
+    "shells": {
+        "up": {"shell": {**TUBE, "poisson_ratio": NU, "tube": [0, 180]}, "boundary": {}},
+        "down": {"shell": {**TUBE, "poisson_ratio": NU, "tube": [180, 360]}, "boundary": {}},
+    },
+    "joints": [{"edges": ["up.top", "down.bottom"]}, {"edges": ["down.top", "up.bottom"]}],
+}
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "ring": (CLOSED, "joints: shells are joined in a ring"),
     "contact": ({"contact": [["outer", "top"]]}, "contact: shells that are joined to each other are modelled with"),
     "sides": ({"joints": [{"edges": ["outer.top", "low.outer"]}]}, "point to opposite sides"),
     "apart": ({"joints": [{"edges": ["outer.top", "top.inner"]}]}, "point to opposite sides|do not meet"),
