@@ -10,6 +10,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import ceil, comb, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
@@ -33,7 +34,9 @@ from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
 from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
-from magshell_fenicsx.shells.tee import MeridianTee
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
@@ -72,7 +75,7 @@ class Waves:
         carrier: Carrier,
         supports: Supports,
         log: KernelLog,
-        touching: Sequence[MeridianTouching | MeridianTee] = (),
+        touching: "Sequence[MeridianTouching | MeridianTee]" = (),
     ) -> None:
         self.touching = touching
         degree = system.u.function_space.element.basix_element.degree
