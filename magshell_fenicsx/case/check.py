@@ -127,7 +127,8 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     k = degree_of(problem.context)
     if patch is None:
         assert problem.meridian
-        pieces = max(len(problem.meridian.pieces), 1)
+        along = problem.meridian
+        pieces = max(len(along.pieces) - sum(one == other for one, other in along.joints), 1)
         count = len(meridian_vertices(problem)) - pieces
         return count, 2 * (k * count + pieces)
     cells, corners = patch.corners, len(np.unique(patch.corners))

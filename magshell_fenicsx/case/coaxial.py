@@ -1,6 +1,6 @@
 """The meridians of several shells of revolution with one axis, one after the other along one parameter."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Place
+from magshell_fenicsx.mesh.assembly import MEET, Place
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.mesh.patch import Deviated, MeshError
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
@@ -95,11 +95,20 @@ class Turned:
         return np.asarray(s if self.upright else s[::-1])
 
     @property
+    def names(self) -> list[str | None]:
+        """Those of its first and last end; None for a pole."""
+        named = [name and f"{self.name}_{name}" for name in self.span.names]
+        return named if self.upright else named[::-1]
+
+    @property
+    def places(self) -> list[tuple[str | None, Array]]:
+        """Their names and places."""
+        return [(name, self.at(np.array([s]))[0]) for name, s in zip(self.names, (self.start, self.end), strict=True)]
+
+    @property
     def piece(self) -> Piece:
         """It as a part of all."""
-        named = [name and f"{self.name}_{name}" for name in self.span.names]
-        first, last = named if self.upright else named[::-1]
-        return Piece(self.name, (self.start, self.end), (first, last), self.foot, self.vertices)
+        return Piece(self.name, (self.start, self.end), self.foot, self.vertices)
 
     def _turned(self, x: Array) -> Array:
         return np.asarray(x if self.upright else x * [1.0, 1.0, -1.0])
@@ -111,9 +120,10 @@ class Turned:
 
 @dataclass(frozen=True)
 class Joined:
-    """Charts (n, 2) of the meridians of all -> places (n, 3)."""
+    """Charts (n, 2) of the meridians of all -> places (n, 3); the parameters of each follow its begin."""
 
     shells: Sequence[Turned]
+    begins: Array
 
     def __call__(self, chart: Array) -> Array:
         return self._along(chart, "at", 3)
@@ -128,8 +138,7 @@ class Joined:
 
     def _along(self, chart: Array, of: str, size: int) -> Array:
         s, values = chart[:, 0], np.empty((len(chart), size))
-        begins = [shell.start for shell in self.shells]
-        which = np.searchsorted(begins, s + APART / 2, side="right") - 1
+        which = np.searchsorted(self.begins, s + ROUNDING, side="right") - 1
         for i, shell in enumerate(self.shells):
             values[which == i] = getattr(shell, of)(s[which == i])
         return values
@@ -143,9 +152,10 @@ def meridians(several: "Several") -> Span | str:
     CaseError, MeshError
         If a shell alone cannot be built; the message begins with its key.
     """
-    if several.joints:
-        return "joints: shells that are joined are modelled all around"
-    shells, start = list[Turned](), 0.0
+    joined = [{several.of(name) for name in names} for names in several.joints]
+    if any(set(pair) in joined for pair in several.pairs):
+        return "contact: shells that are joined to each other are modelled with their circumference"
+    shells = list[Turned]()
     for part in several.parts:
         place, outline = several.place(part), ground_of(part.case.shell).perfect
         key = part.refused("place")
@@ -155,9 +165,54 @@ def meridians(several: "Several") -> Span | str:
         if isinstance(problem, str):
             return part.refused(problem)
         assert problem.meridian
-        shells.append(Turned(part.name, start, problem, problem.meridian, place, outline))
-        start = shells[-1].end + APART
-    return _joined(shells)
+        shells.append(Turned(part.name, 0.0, problem, problem.meridian, place, outline))
+    after = _after(shells, several.joints)
+    if isinstance(after, str):
+        return after
+    places = dict(of for shell in shells for of in shell.places)
+    marked = [_marked(shell, [places[foot] for foot, on in several.joints if on == shell.name]) for shell in shells]
+    ordered = _in_chains(marked, after)
+    return "joints: shells are joined in a ring" if len(ordered) < len(shells) else _joined(ordered, several)
+
+
+def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[str, str] | str:
+    """Shell -> that which goes on where it ends, joined to it; or why two cannot be joined so."""
+    ends = {name: (end, x, shell) for shell in shells for end, (name, x) in enumerate(shell.places)}
+    along = [shell.at(shell.end * np.arange(101.0) / 100) for shell in shells]
+    extent = np.ptp(np.vstack(along), axis=0).max()
+    after = dict[str, str]()
+    for number, names in enumerate(joints):
+        key, both = f"joints.{number}.edges", " and ".join(names)
+        if names[0] in ends and names[1] in {shell.name for shell in shells}:
+            continue  # of a T-junction
+        if any(name not in ends for name in names):
+            return f"{key}: there is no such edge"
+        (begin, x, after_it), (end, y, before_it) = sorted((ends[name] for name in names), key=lambda end: end[0])
+        if (begin, end) != (0, 1):
+            return f"{key}: the normals of {both} point to opposite sides"
+        if np.linalg.norm(x - y) > MEET * extent:
+            return f"{key}: {both} do not meet"
+        after[before_it.name] = after_it.name
+    return after
+
+
+def _marked(shell: Turned, feet: Sequence[Array]) -> Turned:
+    """With cells that end where another shell stands, at places (3,)."""
+    own = [float(shell.own(np.array(shell.foot(x)[0]))) for x in feet]
+    new = [s for s in own if np.abs(shell.span.knots - s).min() > ROUNDING]
+    span = replace(shell.span, circles=(*shell.span.circles, *new))
+    return replace(shell, problem=replace(shell.problem, meridian=span), span=span)
+
+
+def _in_chains(shells: Sequence[Turned], after: Mapping[str, str]) -> list[Turned]:
+    """Along the parameter: each followed by that which is joined to its end, with none between."""
+    by_name, ordered, end = {shell.name: shell for shell in shells}, list[Turned](), -APART
+    for name in (shell.name for shell in shells if shell.name not in after.values()):
+        end, of = end + APART, name or None
+        while of:
+            ordered.append(replace(by_name[of], start=end))
+            end, of = ordered[-1].end, after.get(of)
+    return ordered
 
 
 def _alone(part: "Part") -> Problem | str:
@@ -172,27 +227,35 @@ def _alone(part: "Part") -> Problem | str:
         raise type(e)(part.refused(str(e))) from None
 
 
-def _joined(shells: Sequence[Turned]) -> Span:
-    drawn = Joined(shells)
+def _joined(shells: Sequence[Turned], several: "Several") -> Span:
+    joints, names = several.joints, [part.name for part in several.parts]
+    by_name = {shell.name: shell for shell in shells}
+    joined = {name for one, other in joints if other not in by_name for name in (one, other)}
+    begins = [shell.start - (0 if shell.names[0] in joined else APART / 2) for shell in shells]
+    drawn = Joined(shells, np.array(begins))
 
     def place(x: Array) -> tuple[float, float]:
         """Of a node of the triangulation, which has the number of its shell, or of a place (3,)."""
         if len(x) > len("xyz"):
-            return shells[round(float(x[-1]))].foot(x)
+            return by_name[names[round(float(x[-1]))]].foot(x)
         at = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
         feet = [shell.foot(x) for shell in shells]
         away = [np.linalg.norm(shell.at(np.array([s]))[0] - at) for shell, (s, _) in zip(shells, feet, strict=True)]
         return feet[int(np.argmin(away))]
 
-    pieces = tuple(shell.piece for shell in shells)
+    at = {name: s for shell in shells for name, s in zip(shell.names, (shell.start, shell.end), strict=True)}
+    places = dict(of for shell in shells for of in shell.places)
     span = Span(
         shells[-1].end,
         tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.circles),
-        tuple(name for piece in pieces for name in piece.names),
+        tuple(None if name in joined else name for shell in shells for name in shell.names),
         drawn,
         drawn.normal,
         place,
-        pieces=pieces,
+        pieces=tuple(shell.piece for shell in shells),
+        joints=tuple(
+            (at[one], at[other] if other in at else by_name[other].foot(places[one])[0]) for one, other in joints
+        ),
     )
     reach, h = max(1.0, float(span.sample()[:, 0].max())), shells[0].problem.material.h
     waves = max(shell.most_waves for shell in shells)

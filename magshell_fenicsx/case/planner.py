@@ -144,8 +144,8 @@ def make_problem(
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     rims = different(local)
-    if case.joints and isinstance(beyond, Sector):
-        raise CaseError(f"symmetry: {case.symmetry}: not with joints: take symmetry: half")
+    if isinstance(beyond, Sector) and any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
+        raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())

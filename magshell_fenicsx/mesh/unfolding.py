@@ -179,6 +179,7 @@ def unfolded(patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[st
         one=new[glued[used]] if apart or patch.one is not None else None,
         patches={name: np.tile(inside, count) for name, inside in patch.patches.items()},
         given=None if patch.given is None else np.tile(patch.given, (count, 1)),
+        joints=tuple(both and (np.tile(both[0], count), np.tile(both[1], count)) for both in patch.joints),
     )
 
 

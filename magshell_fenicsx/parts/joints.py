@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dolfinx import fem
 
     from magshell_fenicsx.mesh.midsurface import Midsurface
+    from magshell_fenicsx.models.axisymmetric.meridian import Meridian
     from magshell_fenicsx.models.shell.energy import Density
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
@@ -108,7 +109,7 @@ class Joined(KeyAbility[Sequence[JointSection]]):
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """Planes that cross each joint: its edges are their own mirror images."""
         names = [name for section in self.given for name in section.edges]
-        return [Leaves("joints: shells are joined", mirrors=lambda mirror: all(mirror.other(n) == n for n in names))]
+        return [Leaves(mirrors=lambda mirror: all(mirror.other(n) == n for n in names))]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         scales = context.scales if any(section.stiffness for section in self.given) else None
@@ -190,7 +191,7 @@ class Creases:
     given: "fem.Constant"
 
     @classmethod
-    def of(cls, joints: Sequence[Joint], midsurface: "Midsurface") -> "Creases | None":
+    def of(cls, joints: Sequence[Joint], midsurface: "Midsurface | Meridian") -> "Creases | None":
         """Those of some joints; None if all are rigid."""
         import numpy as np
         from dolfinx import fem

@@ -29,8 +29,6 @@ class Piece:
         Of the shell.
     ends
         First and last value of the parameter.
-    names
-        Of both ends, with that of the shell; None for a pole.
     place
         Place (3,) in space -> parameter of the nearest place of it, and azimuth (rad).
     vertices
@@ -39,7 +37,6 @@ class Piece:
 
     name: str
     ends: tuple[float, float]
-    names: tuple[str | None, str | None]
     place: Callable[[Array], tuple[float, float]]
     vertices: Callable[[Sequence[tuple[float, float]]], Array]
 
@@ -60,7 +57,7 @@ class Span:
     circles
         Where the curvature jumps.
     names
-        Of its ends; None for a pole.
+        Of its ends; None for a pole, and where shells are joined.
     embedding, normal
         Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
     place
@@ -75,6 +72,8 @@ class Span:
         Places (n, 3) of the surface at which formulas are narrow.
     pieces
         Those of several shells; none of one.
+    joints
+        Of each joint of shells both parameters: two edges that meet have the same one.
     """
 
     length: float
@@ -88,6 +87,7 @@ class Span:
     vertices: NDArray[np.float64] | None = None
     also: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     pieces: tuple[Piece, ...] = ()
+    joints: tuple[tuple[float, float], ...] = ()
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""

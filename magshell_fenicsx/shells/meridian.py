@@ -22,10 +22,12 @@ from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
+from magshell_fenicsx.models.shell.edges import FOLD
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
@@ -40,6 +42,7 @@ from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+    from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
 
@@ -122,8 +125,8 @@ class MeridianModel(Thin):
         h(x)/h, free to jump from cell to cell; None for 1.
     made_of
         Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
-    touchings
-        The contacts of shells with each other.
+    touchings, tees
+        The contacts of shells with each other, and their T-junctions.
     """
 
     touchings: "Sequence[MeridianTouching]"
@@ -170,7 +173,11 @@ class MeridianModel(Thin):
             shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
         carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell, pressed=pressed, made_of=self.made_of)
+        folded = meridian.largest_fold(self.r0) > FOLD
+        creases = Creases.of(loads.joints, meridian) if loads.joints else None
+        self.factory = factory = EnergyFactory(
+            carrier, self.u, *of_shell, folded, pressed=pressed, creases=creases, made_of=self.made_of
+        )
         around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
@@ -225,9 +232,14 @@ class MeridianModel(Thin):
             self.touchings = touchings(loads.pairs, *curves, self.thickness)
         for each in self.touchings:
             stiffnesses |= each.history
+        self.tees: list[MeridianTee] = []
+        if any(of is None for of in meridian.joints):
+            from magshell_fenicsx.shells.tee import tees_of_meridian
+
+            self.tees = tees_of_meridian(self)
         self.system = FiniteElementSystem(
             self.u,
-            [*terms, *self.touchings],
+            [*terms, *self.touchings, *self.tees],
             held,
             pattern,
             self.material.h,
@@ -265,7 +277,7 @@ class MeridianModel(Thin):
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
-        return ExcludedWaves(Waves(*of, self.touchings))
+        return ExcludedWaves(Waves(*of, [*self.touchings, *self.tees]))
 
     @property
     def waves(self) -> Waves:

@@ -1,9 +1,9 @@
 """T-junctions: an edge of one shell that stands on another one, and moves and turns with it.
 
-Points of the edge, as many on each side of a triangle as the degree, are tied to the places of the other mid-surface at
-which they are undeformed. So the edge follows the other shell, whose own displacements stay free: cells need not meet.
-Both ties are springs, `TIGHT` times as stiff as an element beside them. With n of the edge's cell and m of the other
-shell, t along the edge, s = t . (n x m) and c = n . m:
+Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied to the places of
+the other mid-surface at which they are undeformed. So the edge follows the other shell, whose own displacements stay
+free: cells need not meet. Both ties are springs, `TIGHT` times as stiff as an element beside them. With n of the edge's
+cell and m of the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
 """
@@ -15,7 +15,9 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
@@ -26,22 +28,141 @@ from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.parts.touching.nearest import Cells, places_near
+from magshell_fenicsx.platform import compat
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 TIGHT = 1e4  # stiffness of a tie over that of an element
+NEAR = 2e-9  # of a parameter: rounding
 APART = 0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
 SIDES = np.array([[1, 2], [0, 2], [0, 1]])
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 AROUND = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
 PARTS = 12  # of both tangents of both shells at a point
+AROUND_E3 = np.array([[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]])  # (U, W) -> vector and its derivative
 
 
-class Tee:
-    """The energy of a junction; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+class Tie:
+    """Points of an edge tied to places of another shell: an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+
+    Parameters
+    ----------
+    unknowns
+        (n, k) global numbers of those on which each point depends.
+    gap, tangents
+        (n, 3, k) and (n, 12, k): what makes of these u - u', and both tangents of both shells.
+    along
+        (n, 2) the edge's direction in the coordinates of its cell.
+    stiffness
+        (n, 2) of both ties.
+    """
+
+    amplitude = None
+    column = "bending"
+
+    def __init__(
+        self,
+        joint: Joint,
+        r0: fem.Function,
+        u: fem.Function,
+        unknowns: Longs,
+        gap: Array,
+        tangents: Array,
+        along: Array,
+        stiffness: Array,
+        log: KernelLog,
+    ) -> None:
+        V = u.function_space
+        self._comm, self._u, self._size = V.mesh.comm, u, V.dofmap.bs
+        index = V.dofmap.index_map
+        self._own = self._size * index.local_range[0], self._size * index.size_local
+        self.name = self.group = f"joint of {' and '.join(joint.edges)}"
+        self._unknowns, self._gaps, self._tangents, self._tie = unknowns, gap, tangents, stiffness[:, 0]
+        self._turns = bool(joint.rigid or joint.stiffness)
+        self._points = Points(max(len(unknowns), 1))
+        self._present, self._moved = self._points.field(PARTS), self._points.field(PARTS)
+        # direction along the edge, sine and cosine of the placement, stiffness
+        self._fixed = fixed = self._points.field(5)
+        angle = _angle(self._present, self._moved, fixed)
+        sine = angle[0] * fixed[3] - angle[1] * fixed[2]
+        cosine = angle[1] * fixed[3] + angle[0] * fixed[2]
+        W = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
+        self._moved.x.array[:] = 0.0
+        self._kernels: Mapping[str, PointKernel] = {
+            "angle": point_values("T-junction angle", angle, log, self._comm),
+            "energy": point_values("T-junction energy", W, log, self._comm),
+            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log, self._comm),
+            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log, self._comm),
+        }
+        self._placed = self._times(tangents, whole(r0))
+        values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]
+        values[:, :2], values[:, 4] = along, stiffness[:, 1]
+        values[:, 2:4] = self._at("angle", 0 * whole(r0))
+
+    # as a term
+
+    def compile_residual(self) -> None:
+        """Its kernels are compiled."""
+
+    def compile_tangent(self) -> None:
+        """Its kernels are compiled."""
+
+    def energy(self) -> float:
+        u = whole(self._u)
+        tied = float(self._tie @ np.sum(self._times(self._gaps, u) ** 2, axis=1)) / 2
+        return tied + (float(self._at("energy", u).sum()) if self._turns else 0.0)
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        u = whole(self._u)
+        residual = np.zeros(u.size)
+        forces = np.einsum("nc,nck->nk", self._tie[:, None] * self._times(self._gaps, u), self._gaps)
+        if self._turns:
+            forces += np.einsum("nc,nck->nk", self._at("gradient", u), self._tangents)
+        np.add.at(residual, self._unknowns, factor * forces)
+        add_own(b, residual, self._own, self._comm)
+
+    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
+        """None here: what assembles the others adds `entries`."""
+
+    def entries(self) -> Entries:
+        return _entries(self._unknowns, self._second(self._gaps, self._tangents))
+
+    def around(self) -> tuple[Longs, Longs]:
+        """See `Coupled`: those that act on each other always do."""
+        return pairs_of(self._unknowns[:, :: self._size] // self._size)
+
+    @property
+    def since(self) -> float:
+        """See `Coupled`."""
+        return 0.0
+
+    def _second(self, gap: Array, tangents: Array) -> Array:
+        """(n, k, k) the second variation at the present u, along what these make of any k unknowns."""
+        H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
+        if self._turns and len(H):
+            of_parts = np.zeros((len(H), PARTS, PARTS))
+            upper = np.triu_indices(PARTS)
+            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", whole(self._u))
+            H += np.einsum("nik,nij,njl->nkl", tangents, of_parts, tangents, optimize=True)
+        return np.asarray(H)
+
+    def _times(self, maps: Array, u: Array) -> Array:
+        """(n, c) what maps (n, c, k) make of the values (nodes, components) of all nodes."""
+        return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
+
+    def _at(self, kernel: str, u: Array) -> Array:
+        """(n, ..) what a kernel gives at the points, with this displacement (nodes, components) of all nodes."""
+        count = len(self._unknowns)
+        self._present.x.array[: count * PARTS] = (self._placed + self._times(self._tangents, u)).ravel()
+        return np.array(self._points.evaluate(self._kernels[kernel], count))
+
+
+class Tee(Tie):
+    """The junction of two surfaces.
 
     Parameters
     ----------
@@ -58,9 +179,6 @@ class Tee:
         On every rank, if the edge is not on the other shell; the message begins with `key`.
     """
 
-    amplitude = None
-    column = "bending"
-
     def __init__(
         self,
         joint: Joint,
@@ -74,14 +192,10 @@ class Tee:
         log: KernelLog,
     ) -> None:
         V = r0.function_space
-        self._comm, element, index = V.mesh.comm, V.element.basix_element, V.dofmap.index_map
-        self._own = 3 * index.local_range[0], 3 * index.size_local
-        self.name = self.group = f"joint of {' and '.join(joint.edges)}"
-        self._of_all, self._r0, self._u = CellsOfAll.of(V), whole(r0), u
-        self._element = element
+        self._of_all, self._r0, self._element = CellsOfAll.of(V), whole(r0), V.element.basix_element
         first = self._of_all.own.start
         cells, ends = _sides(V, foot, len(self._of_all.own))
-        s, weights = basix.make_quadrature(basix.CellType.interval, 2 * element.degree - 1)
+        s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
         along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
         cell = np.repeat(first + cells, len(s))
@@ -92,100 +206,25 @@ class Tee:
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
         other, Y, apart = self._places(x, np.flatnonzero(self._of_all.gathered(on)))
-        self._refuse_apart(apart, x, material.h, key, joint)
+        _refuse_apart(V.mesh.comm, apart, x, material.h, key, joint)
         on_other = self._shapes(Y)
-        self._nodes = np.concatenate([nodes[cell], nodes[other]], axis=1)
-        self._beta = np.concatenate([on_edge[0], -on_other[0]], axis=1)
-        self._D = np.zeros((len(x), 4, self._nodes.shape[1]))
-        half = nodes.shape[1]
-        self._D[:, :2, :half], self._D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (on_edge, on_other))
+        both = np.concatenate([nodes[cell], nodes[other]], axis=1)
         of_cells = self._of_all.gathered(stiffness)
-        stiff = np.maximum(of_cells[cell], of_cells[other]) / length[:, None]
-        self._tie = weight * TIGHT * stiff[:, 0]
-        turned = weight * (TIGHT * stiff[:, 1] * material.bending_stiffness if joint.rigid else joint.stiffness)
-        self._turns = bool(joint.rigid or joint.stiffness)
-        self._points = Points(max(len(x), 1))
-        self._tangents, self._moved = self._points.field(PARTS), self._points.field(PARTS)
-        # direction along the edge, sine and cosine of the placement, stiffness
-        self._fixed = fixed = self._points.field(5)
-        angle = _angle(self._tangents, self._moved, fixed)
-        sine = angle[0] * fixed[3] - angle[1] * fixed[2]
-        cosine = angle[1] * fixed[3] + angle[0] * fixed[2]
-        W = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
-        self._moved.x.array[:] = 0.0
-        self._kernels: Mapping[str, PointKernel] = {
-            "angle": point_values("T-junction angle", angle, log, self._comm),
-            "energy": point_values("T-junction energy", W, log, self._comm),
-            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log, self._comm),
-            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log, self._comm),
-        }
-        values = fixed.x.array.reshape(-1, 5)[: len(x)]
-        values[:, :2], values[:, 4] = along, turned
-        values[:, 2:4] = self._at("angle", self._r0)
-
-    # as a term
-
-    def compile_residual(self) -> None:
-        """Its kernels are compiled."""
-
-    def compile_tangent(self) -> None:
-        """Its kernels are compiled."""
-
-    def energy(self) -> float:
-        u = whole(self._u)
-        gap = self._gap(u)
-        tied = float(self._tie @ np.sum(gap**2, axis=1)) / 2
-        return tied + (float(self._at("energy", self._r0 + u).sum()) if self._turns else 0.0)
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        u, residual = whole(self._u), np.zeros(self._r0.shape)
-        forces = (self._tie[:, None] * self._gap(u))[:, None, :] * self._beta[:, :, None]
-        if self._turns:
-            g = self._at("gradient", self._r0 + u).reshape(-1, 4, 3)
-            forces = forces + np.einsum("nik,nic->nkc", self._D, g)
-        np.add.at(residual, self._nodes, factor * forces)
-        add_own(b, residual, self._own, self._comm)
-
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
-
-    def entries(self) -> Entries:
-        r = self._r0 + whole(self._u)
-        count, k = self._nodes.shape
-        H = np.zeros((count, k, 3, k, 3))
-        tied = self._tie[:, None, None] * self._beta[:, :, None] * self._beta[:, None, :]
-        for c in range(3):
-            H[:, :, c, :, c] = tied
-        if self._turns and count:
-            of_parts = np.zeros((count, PARTS, PARTS))
-            upper = np.triu_indices(PARTS)
-            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", r)
-            H += np.einsum("nik,nicjd,njl->nkcld", self._D, of_parts.reshape(count, 4, 3, 4, 3), self._D, optimize=True)
-        dofs = (3 * self._nodes[:, :, None] + np.arange(3)).reshape(count, 3 * k)
-        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
-        return rows.ravel(), columns.ravel(), H.ravel()
-
-    def around(self) -> tuple[Longs, Longs]:
-        """See `Coupled`: those that act on each other always do."""
-        return pairs_of(self._nodes)
-
-    @property
-    def since(self) -> float:
-        """See `Coupled`."""
-        return 0.0
-
-    # geometry
-
-    def _gap(self, u: Array) -> Array:
-        """u - u' (n, 3) at the points, from the displacement (nodes, 3) of all nodes."""
-        return np.asarray(np.einsum("nk,nkc->nc", self._beta, u[self._nodes]))
-
-    def _at(self, kernel: str, r: Array) -> Array:
-        """(n, ..) what a kernel gives at the points, where the nodes are at r (nodes, 3)."""
-        count = len(self._nodes)
-        z = np.einsum("nik,nkc->nic", self._D, r[self._nodes])
-        self._tangents.x.array[: count * PARTS] = z.ravel()
-        return np.array(self._points.evaluate(self._kernels[kernel], count))
+        half, axes = nodes.shape[1], np.eye(3)
+        D = np.zeros((len(x), 4, both.shape[1]))
+        D[:, :2, :half], D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (on_edge, on_other))
+        beta = np.concatenate([on_edge[0], -on_other[0]], axis=1)
+        super().__init__(
+            joint,
+            r0,
+            u,
+            (3 * both[:, :, None] + np.arange(3)).reshape(len(x), 3 * both.shape[1]),
+            np.einsum("nk,cd->nckd", beta, axes).reshape(len(x), 3, -1),
+            np.einsum("nik,cd->nickd", D, axes).reshape(len(x), PARTS, -1),
+            along,
+            _stiff(joint, material, np.maximum(of_cells[cell], of_cells[other]), length, weight),
+            log,
+        )
 
     def _shapes(self, X: Array) -> Array:
         """(3, n, functions): shape functions at places and their derivatives."""
@@ -213,17 +252,93 @@ class Tee:
         nearest[point[best]], Y[point[best]], apart[point[best]] = cells[which[best]], foot[best], distance[best]
         return nearest, Y, apart
 
-    def _refuse_apart(self, apart: Array, x: Array, h: float, key: str, joint: Joint) -> None:
-        worst = int(apart.argmax()) if len(apart) else -1
-        of_rank = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
-        far, place = max(self._comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0])
-        if far > APART * h:
-            foot, other = joint.edges
-            by = f"by {far:.4g} R" if np.isfinite(far) else "by more than a cell"
-            raise MeshError(
-                f"{key}: the edge {foot} is not on the mid-surface of {other}, {by} at {place_text(place)}, over R: "
-                "move one of the shells"
-            )
+
+class MeridianTee(Tie):
+    """The junction of two meridians, which are `Tie`d at one point.
+
+    Parameters
+    ----------
+    tied
+        The parameters of both.
+    stiffness
+        See `Tee`.
+    """
+
+    def __init__(
+        self,
+        joint: Joint,
+        key: str,
+        r0: fem.Function,
+        u: fem.Function,
+        tied: tuple[float, float],
+        stiffness: Array,
+        material: Material,
+        log: KernelLog,
+    ) -> None:
+        V = r0.function_space
+        ends, dofs = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0], V.dofmap.list
+        inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
+        cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
+        self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
+        self._shapes = []
+        for s, of in zip(tied, cells, strict=True):
+            lengths = (ends[of, 1] - ends[of, 0])[:, None]
+            N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(of)
+            self._shapes.append((N.ravel(), (slopes / lengths).ravel()))
+        nodal = r0.x.array.reshape(-1, 2)
+        (rho, z), other = (N @ nodal[dofs[of].ravel()] for (N, _), of in zip(self._shapes, cells, strict=True))
+        apart = np.array([np.hypot(*(other - [rho, z]))])
+        _refuse_apart(V.mesh.comm, apart, np.array([[rho, 0.0, z]]), material.h, key, joint)
+        foot = int(cells[0][0])
+        length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(self._shapes[0][1] @ nodal[dofs[foot]])
+        stiff = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
+        ties = _stiff(joint, material, stiff, np.array([length]), 2 * np.pi * np.array([rho]))
+        of_u = self._numbers(2), *self._maps(AROUND_E3)
+        super().__init__(joint, r0, u, *of_u, np.array([[0.0, 1.0]]), ties, log)
+
+    def entries_of_waves(self, m: float) -> Entries:
+        """Those of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
+        cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
+        sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
+        U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
+        H = sum(self._second(*self._maps(part @ U_from_P)) for part in (cosine, sine))
+        return _entries(self._numbers(3), np.asarray(H / 2))
+
+    def _numbers(self, size: int) -> Longs:
+        return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
+
+    def _maps(self, of: Array) -> tuple[Array, Array]:
+        """`gap` and `tangents`; `of` (2, 3, c) makes of a node's numbers its vector, and the derivative around e3."""
+        value, around = of
+        places, tangents = [], []
+        for N, along in self._shapes:
+            places.append(np.kron(N, value))
+            tangents.append(np.vstack([np.kron(along, value), np.kron(N, around)]))
+        return np.hstack([places[0], -places[1]])[None], block_diag(*tangents)[None]
+
+
+def _entries(unknowns: Longs, H: Array) -> Entries:
+    rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
+    return rows.ravel(), columns.ravel(), H.ravel()
+
+
+def _stiff(joint: Joint, material: Material, factors: Array, length: Array, weight: Array) -> Array:
+    """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides of that length."""
+    turned = TIGHT * factors[:, 1] * material.bending_stiffness / length if joint.rigid else joint.stiffness
+    return np.column_stack([weight * TIGHT * factors[:, 0] / length, weight * turned])
+
+
+def _refuse_apart(comm: MPI.Comm, apart: Array, x: Array, h: float, key: str, joint: Joint) -> None:
+    worst = int(apart.argmax()) if len(apart) else -1
+    of_rank = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
+    far, place = max(comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0])
+    if far > APART * h:
+        foot, other = joint.edges
+        by = f"by {far:.4g} R" if np.isfinite(far) else "by more than a cell"
+        raise MeshError(
+            f"{key}: the edge {foot} is not on the mid-surface of {other}, {by} at {place_text(place)}, over R: "
+            "move one of the shells"
+        )
 
 
 def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
@@ -260,24 +375,31 @@ def tees(model: "ShellModel") -> list[Tee]:
     tied += [(Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items()]
     if not tied:
         return []
-    cells = model.V.mesh.topology.index_map(2)
+    edges, factors, log = surface.edges, _factors(model), model.kernels
+    return [
+        Tee(joint, key, model.r0, model.u, edges[joint.edges[0]], on, factors, model.material, log)
+        for joint, key, on in tied
+    ]
+
+
+def tees_of_meridian(model: "MeridianModel") -> list[MeridianTee]:
+    """The same of a meridian."""
+    meridian, factors, log = model.meridian, _factors(model), model.kernels
+    tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
+    return [
+        MeridianTee(joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log)
+        for i, (joint, s, of) in tied
+        if of is None
+    ]
+
+
+def _factors(model: "ShellModel | MeridianModel") -> Array:
+    """(cells of this rank, 2) E h and E h^3 of each over those of the first shell."""
+    cells = model.V.mesh.topology.index_map(model.V.mesh.topology.dim)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
     if model.thickness is not None:
         t = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
         factors *= np.column_stack([t, t**3])
     if model.made_of is not None:
         factors *= model.made_of.x.array.reshape(-1, 4)[model.made_of.function_space.dofmap.list[:, 0], :1]
-    return [
-        Tee(
-            joint,
-            key,
-            model.r0,
-            model.u,
-            surface.edges[joint.edges[0]],
-            on,
-            factors,
-            model.material,
-            model.kernels,
-        )
-        for joint, key, on in tied
-    ]
+    return factors

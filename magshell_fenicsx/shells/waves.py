@@ -10,6 +10,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import ceil, comb, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
@@ -34,6 +35,9 @@ from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.shells.tee import MeridianTee
+
 Array = NDArray[np.float64]
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
 
@@ -50,7 +54,7 @@ class Waves:
     supports
         What is held.
     touching
-        Contacts, whose entries are not in the pattern of the others.
+        Contacts and T-junctions, whose entries are not in the pattern of the others.
 
     Attributes
     ----------
@@ -71,7 +75,7 @@ class Waves:
         carrier: Carrier,
         supports: Supports,
         log: KernelLog,
-        touching: Sequence[MeridianTouching] = (),
+        touching: "Sequence[MeridianTouching | MeridianTee]" = (),
     ) -> None:
         self.touching = touching
         degree = system.u.function_space.element.basix_element.degree

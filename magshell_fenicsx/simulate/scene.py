@@ -91,7 +91,7 @@ def build_meridian(problem: Problem) -> Meridian:
     pieces = [(piece.name, piece.ends) for piece in span.pieces]
     held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
     vertices = meridian_vertices(problem)
-    return make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held)
+    return make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints)
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":

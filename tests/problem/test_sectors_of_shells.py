@@ -30,9 +30,22 @@ RINGS: dict[str, Any] = {
 GRIPPER = read_source(CASES / "gripper_closed.yaml")
 
 
+def wall(radius: float) -> dict[str, Any]:
+    shell = {"geometry": "cylinder", "radius": radius, "length": 0.3, **MATERIAL}
+    return {"shell": shell, "boundary": {"top": "clamped"}}
+
+
+JOINED: dict[str, Any] = {
+    "shells": {"lower": RING, "tube": wall(0.6)},
+    "joints": [{"edges": ["tube.bottom", "lower.inner"], "kind": "spring", "stiffness": 1e-4, "angle": 30}],
+    "mesh": {"degree": 3, "size": 0.2},
+}
+
+
 def sector(name: str) -> Case:
     """A case in the sector of 30 or of 45 degrees."""
-    return Case.from_source(RINGS | {"symmetry": 6}) if name == "rings" else Case.from_source(GRIPPER)
+    data = {"rings": RINGS | {"symmetry": 6}, "joined": JOINED | {"symmetry": 6}}
+    return Case.from_source(data.get(name, GRIPPER))
 
 
 NOT_THERE: dict[str, tuple[dict[str, Any], str]] = {
@@ -40,13 +53,9 @@ NOT_THERE: dict[str, tuple[dict[str, Any], str]] = {
         {"shells": {"lower": RING, "upper": {**RING, "place": {"position": [3, 0, 0]}}}},
         "no two mirror planes .* each shell is held, and its own image in both",
     ),
-    "joints": (
-        {
-            "shells": {"lower": RING, "upper": {**TURNED, "place": {"position": [0, 0, 0], "axis": {"polar": 180}}}},
-            "joints": [{"edges": ["lower.outer", "upper.outer"]}],
-            "contact": [],
-        },
-        "symmetry: 6: not with joints: take symmetry: half",
+    "a T-junction": (
+        {"shells": {"lower": RING, "web": wall(0.8)}, "joints": [{"edges": ["web.bottom", "lower"]}]},
+        "symmetry: 6: not with a T-junction: take symmetry: half",
     ),
 }
 
@@ -71,7 +80,7 @@ def symmetric(scene: Scene, size: float) -> np.ndarray:
     return np.asarray(model.system.held(u.ravel()))
 
 
-@pytest.mark.parametrize("name", ["rings", "gripper"])
+@pytest.mark.parametrize("name", ["rings", "gripper", "joined"])
 def test_copies_make_the_half(name: str) -> None:
     """Energy, contact force and residual of the half at the copies of a displacement: those of the sector, 1e-9."""
     scene = Scene(sector(name))
@@ -80,13 +89,16 @@ def test_copies_make_the_half(name: str) -> None:
     assert isinstance(model.excluded_modes, UnfoldedModes)
     half = model.excluded_modes.half
     assert (model.multiplicity, half.multiplicity) == (2 * waves, 2)
-    u, mu = symmetric(scene, 0.4 if name == "rings" else 2.0), {**scene.unloaded().mu}
-    mu |= {key: 1e-3 for key in ("lambda_m", "pressure") if key in mu}
+    size = {"rings": 0.4, "gripper": 2.0, "joined": 1e-7}[name]  # the sine of its angles is the angle
+    u, mu = symmetric(scene, size), {**scene.unloaded().mu}
+    mu |= {key: 1e-3 for key in ("lambda_m", "pressure", "fold") if key in mu}
     copies = model.excluded_modes.unfolded(u)
     way = symmetric(scene, 1.0) * (1 + np.arange(model.system.size) % 2)  # of no meaning, and not along u
-    way = model.system.held(way) if name == "rings" else u
+    way = u if name == "gripper" else model.system.held(way)
     works = [model.system.residual(u, mu) @ way, half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way)]
     assert works[1] == pytest.approx(waves * works[0], rel=1e-9)
+    if name == "joined":
+        return
     ours, theirs = (system.at(State(v, mu)) for system, v in ((model.system, u), (half.system, copies)))
     forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)

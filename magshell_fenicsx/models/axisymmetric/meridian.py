@@ -12,6 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
+from magshell_fenicsx.models.shell.patterns import places
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -40,6 +41,8 @@ class Meridian:
         See `shape.turning.Span`.
     patches
         Name of each of several shells -> which cells; none of one.
+    tied
+        Of each joint the parameters that it ties, see `shape.turning.Span`.
     """
 
     mesh: mesh.Mesh
@@ -49,6 +52,7 @@ class Meridian:
     points: Mapping[str, tuple[float, float]]
     curvature: float
     patches: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    tied: Sequence[tuple[float, float]] = ()
 
     @property
     def shells(self) -> tuple[str, ...]:
@@ -88,11 +92,29 @@ class Meridian:
         away = np.abs(self._at(self.axis) - self.points[point][0])
         return np.asarray(self.axis[away == away.min(initial=inf)][:1])
 
-    def by_shell(self, facets: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-        """Those of each of several shells; all of one."""
-        s = self._at(facets)
-        inside = [self._ends[of] for of in self.patches.values()] or [self._ends]
-        return [facets[(ends.min() <= s) & (s <= ends.max())] for ends in inside]
+    @property
+    def bodies(self) -> list[NDArray[np.bool_]]:
+        """The cells of each shell, or of those that joints connect."""
+        bodies = [*self.patches.values()] or [np.ones(len(self._ends), dtype=bool)]
+        for both in self.tied:
+            begin, end = self._ends[:, :1] - ROUNDING, self._ends[:, 1:] + ROUNDING
+            at = ((begin < both) & (both < end)).any(axis=1)
+            parts = [of for of in bodies if (of & at).any()]
+            bodies = [of for of in bodies if all(of is not part for part in parts)] + [np.any(parts, axis=0)]
+        return bodies
+
+    def by_body(self, facets: NDArray[np.int32]) -> list[NDArray[np.int32]]:
+        """Those on each of `bodies`."""
+        return [facets[np.isin(self._at(facets), self._ends[of])] for of in self.bodies]
+
+    @property
+    def joints(self) -> list[Array | None]:
+        """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a T-junction."""
+        near = [np.abs(self._ends - one) < ROUNDING for one, _ in self.tied]
+        return [
+            1.0 * at[:, 1] - 1.0 * at[:, 0] if one == other else None
+            for at, (one, other) in zip(near, self.tied, strict=True)
+        ]
 
     @property
     def _ends(self) -> Array:
@@ -116,6 +138,17 @@ class Meridian:
         r0.x.array[:] = self.section(s).ravel()
         return r0
 
+    def largest_fold(self, r0: fem.Function) -> float:
+        """The largest angle (rad) between the undeformed normals at a joint of two edges."""
+        nodes, normals, angles = r0.function_space.dofmap.list, places(r0)[1], [0.0]
+        for marks in self.joints:
+            if marks is not None:
+                cells = [int(marks.argmax()), int(marks.argmin())]
+                (i,), (j,) = np.nonzero(np.equal.outer(*nodes[cells]))
+                n, m = normals[cells, [i, j]]
+                angles.append(float(np.arctan2(np.linalg.norm(np.cross(n, m)), n @ m)))
+        return max(angles)
+
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement in the same space."""
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
@@ -132,6 +165,7 @@ def make_meridian(
     curvature: float = 1.0,
     pieces: Sequence[tuple[str, tuple[float, float]]] = (),
     held: Collection[str] = (),
+    tied: Sequence[tuple[float, float]] = (),
 ) -> Meridian:
     """Mesh the meridian.
 
@@ -145,9 +179,11 @@ def make_meridian(
         See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place, and where that is
         held the highest on the axis.
     pieces
-        Name and ends of each of several shells, which no cells join.
+        Name and ends of each of several shells, between which are no cells.
     held
         Ends that supports hold.
+    tied
+        See `Meridian`.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
     parts = [ends for _, ends in pieces] or [(float(vertices[0]), float(vertices[-1]))]
@@ -181,7 +217,7 @@ def make_meridian(
         points = {**(points or {}), "pole": (s, 0.0)}
     middles = domain.geometry.x[compat.corner_numbers(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in pieces}
-    return Meridian(domain, axis, ends, embedding, points, curvature, patches)
+    return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
 
 
 def graded_vertices(

@@ -55,7 +55,7 @@ class Supports:
         Of m = 0 the motion along e3 is 1, that around it is counted under -1. Each of m = 1 has a twin.
         """
         free = {0: 0, -1: len(self.turning()), 1: 0}
-        for horizontal, axial in self._by_shell():
+        for horizontal, axial in self._by_body():
             # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
             rows = [[1.0, z] for _, z in self._places(r0, horizontal)]
             rows += [[0.0, rho] for rho, _ in self._places(r0, axial)]
@@ -64,10 +64,9 @@ class Supports:
         return free
 
     def turning(self) -> list[NDArray[np.bool_]]:
-        """The cells of each shell that no support keeps from turning about e3."""
-        every = np.ones(len(self.meridian.order), dtype=bool)
-        shells = [*self.meridian.patches.values()] or [every]
-        return [cells for cells, (horizontal, _) in zip(shells, self._by_shell(), strict=True) if not len(horizontal)]
+        """The cells of each shell, or of those joined, that no support keeps from turning about e3."""
+        bodies = zip(self.meridian.bodies, self._by_body(), strict=True)
+        return [cells for cells, (horizontal, _) in bodies if not len(horizontal)]
 
     def free_motion(self, r0: fem.Function) -> str:
         """A rigid motion that is left free, as a message; empty if there is none. Nothing but supports holds it."""
@@ -78,9 +77,9 @@ class Supports:
             return NOT_HELD + ("move along (1, 0, 0)" if self.turning() else "turn")
         return ""
 
-    def _by_shell(self) -> list[tuple[Facets, Facets]]:
-        """Where the displacements of each shell normal to e3 and along e3 are zero."""
-        return list(zip(*map(self.meridian.by_shell, (self.horizontal, self.axial)), strict=True))
+    def _by_body(self) -> list[tuple[Facets, Facets]]:
+        """Where the displacements of each of these normal to e3 and along e3 are zero."""
+        return list(zip(*map(self.meridian.by_body, (self.horizontal, self.axial)), strict=True))
 
     @staticmethod
     def _places(r0: fem.Function, facets: Facets) -> NDArray[np.float64]:

@@ -205,6 +205,8 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     if record.step and scene.problem.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric
+    if model.tees:
+        raise CaseError(f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half")
     system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
     refuse_meeting(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
