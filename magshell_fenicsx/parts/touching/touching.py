@@ -16,7 +16,7 @@ Where the thickness varies, half of it H at nodes is a fourth unknown: d is then
 plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from dolfinx import fem
@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
-from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import SOFT, penalty
-from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place, with_growth
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
 from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, on_nodes, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
@@ -84,13 +83,13 @@ class Touching(ContactTerm):
         shape: Shape,
         faces: Faces | None = None,
     ) -> None:
-        super().__init__(pair)
+        super().__init__(pair, shape, faces)
         self.cuts, rule = Number(0.0), segments.rule
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
-        self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
+        self._parts = 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
-        self._touched, self._shape = nodes, shape
+        self._touched = nodes
         self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
         self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
         self._grown = 0.0  # the natural stretch there
@@ -142,13 +141,6 @@ class Touching(ContactTerm):
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
-
-    # by what grows
-
-    def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
-        """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
-        grown = self._faces.grown if self._faces else None
-        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
