@@ -18,7 +18,7 @@ from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import ROUNDING, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, with_growth
-from magshell_fenicsx.parts.touching.faces import Faces
+from magshell_fenicsx.parts.touching.faces import Faces, on_nodes
 from magshell_fenicsx.parts.touching.section import Pair
 
 Array = NDArray[np.float64]
@@ -189,8 +189,8 @@ class ContactTerm:
 
     def __init__(self, pair: Pair, shape: Shape, faces: Faces | None) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
-        self._shape: Shape = shape
-        self._faces = faces
+        self._shape, self._faces = shape, faces
+        self._at: Array = np.zeros((0, 0))  # the displacement of the places
         self.group = self.name
         self.stiffness = Number(pair.stiffness)
         self.looks: Sequence[Look] = ()  # see `InSteps`
@@ -200,6 +200,10 @@ class ContactTerm:
     def history(self) -> dict[str, tuple[Number, float]]:
         """See `FiniteElementSystem`."""
         return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor dPi/du; collective."""
+        self._add(b, factor * np.sum(of_each(self, lambda: self._on_nodes(self._forces())), axis=0))  # type: ignore[arg-type]
 
     def compile_residual(self) -> None:
         """It has no forms."""
@@ -218,6 +222,13 @@ class ContactTerm:
         """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
         grown = self._faces.grown if self._faces else None
         return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
+
+    def _on_nodes(self, forces: Array) -> Array:
+        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
+
+    def _forces(self) -> Array:
+        """The derivative (nodes, dim) of this rank's energy by the places of all nodes, or by H too."""
+        raise NotImplementedError
 
     def _entries(self) -> Entries:
         raise NotImplementedError

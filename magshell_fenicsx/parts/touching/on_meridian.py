@@ -28,7 +28,7 @@ from magshell_fenicsx.parts.gap import SOFT, Grown, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Around, Close, Curves, Faced, distances, nowhere, slopes
-from magshell_fenicsx.parts.touching.faces import on_nodes, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import STEEP, between_held
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 from magshell_fenicsx.parts.touching.nearest import FOLLOWING, Joined, highest
@@ -87,7 +87,7 @@ class MeridianTouching(ContactTerm):
             undeformed = np.column_stack([r0, self._half])
             nodal = undeformed[self._nodes]
             self._around = Around(self._x_of(undeformed), nodal, self._nodes, self._rule.cell)
-        self._at: Array = np.full_like(r0, np.nan)
+        self._at = np.full_like(r0, np.nan)
         self._grown = 0.0
         self._places = nowhere()
         self._looked_at = Kept[tuple[Array, Faced]]()
@@ -100,10 +100,6 @@ class MeridianTouching(ContactTerm):
         """Of the whole shell."""
         at = self._pressed()
         return float(self._rule.weight[at.point] @ self._penalty(at)[0]) / 2
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        forces = np.sum(of_each(self, lambda: on_nodes(self._faces, self._at, self._forces())), axis=0)
-        self._add(b, factor * forces)
 
     def _add(self, b: Array, forces: Array) -> None:
         b[: forces.size] += forces.ravel()

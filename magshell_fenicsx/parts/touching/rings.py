@@ -81,7 +81,7 @@ class Rings(Faces):
     def _of(self, rows: Array) -> Array:
         """By the unknowns (cells, places, dofs)."""
         rows = rows if self._m is not None else rows[..., IN_PLANE]
-        return np.asarray(rows.reshape(*rows.shape[:2], -1))
+        return np.asarray(rows.reshape(*rows.shape[:2], rows.shape[2] * rows.shape[3]))
 
     def _area_slopes(self, u: Array, some: Longs) -> Array:
         rho, speed, a, b = self._changes(u, some)

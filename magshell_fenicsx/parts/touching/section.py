@@ -66,6 +66,10 @@ class Pair:
     bound: float = 1e-3
     given: bool = False
 
+    def has(self, shell: str) -> bool:
+        """Whether one of several shells with this name may touch."""
+        return shell in self.names or WHOLE in self.names
+
     @property
     def setting(self) -> str:
         """Name of its stiffness in a state; no name of a user has a space."""

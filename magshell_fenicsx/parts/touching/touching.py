@@ -28,9 +28,9 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, on_nodes, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
@@ -91,7 +91,7 @@ class Touching(ContactTerm):
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
         self._touched = nodes
         self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
-        self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
+        self._at = np.full_like(r0, np.nan)
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
@@ -110,10 +110,6 @@ class Touching(ContactTerm):
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
         return float(self._points.weight[at.point[joined.first]] @ value) / 2
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        of_looks = of_each(self, lambda: self._on_nodes(self._forces()))
-        self._add(b, factor * np.sum(of_looks, axis=0))
 
     def _entries(self) -> Entries:
         """Those of the present state, once for the tangent and its products; of looks each time."""
@@ -160,9 +156,6 @@ class Touching(ContactTerm):
         of_all = self._cells, self._r0, self._at, self._faces, self._points
         found = self._by_parts, self._entries, self._geometry
         return Present(*of_all, places, joined, pressed, self._forces(), *found)
-
-    def _on_nodes(self, forces: Array) -> Array:
-        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 3) of this rank's points; collective."""
