@@ -102,8 +102,10 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -
 def check_derivatives(
     scene: Scene, flat: NDArray[np.float64], deep: tuple[float, float], h: float, seed: int = 0, far: float = 100.0
 ) -> None:
-    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds, `far` the step of the energy's
-    difference over that of the forces'."""
+    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds.
+
+    `far` is the step of the energy's difference over that of the forces'.
+    """
     system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
     rough, moved, other = (
         system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)

@@ -277,12 +277,14 @@ class Curves:
         shape = self.table(0, self._start)[0]
         off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
         X = self._start[distances(off).argmin(axis=1)]
+        moving = np.arange(len(X))
         for _ in range(ROUNDS):
-            pull, bent, speed = slopes(x[point], self.jets(X, nodal[cell]))
+            pull, bent, speed = slopes(x[point[moving]], self.jets(X[moving], nodal[cell[moving]]))
             step = pull / np.where(bent > FLAT * speed, bent, speed)
-            after = np.clip(X + np.clip(step, -0.25, 0.25), 0.0, 1.0)
-            moved, X = np.abs(after - X).max(initial=0.0), after
-            if moved < EXACT:
+            before = X[moving]
+            X[moving] = np.clip(before + np.clip(step, -0.25, 0.25), 0.0, 1.0)
+            moving = moving[np.abs(X[moving] - before) >= EXACT]
+            if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
         pull, *_ = slopes(x[point], jets)
