@@ -118,3 +118,37 @@ def test_a_pair_of_all_shells_is_that_of_two() -> None:
     assert seen[0][0] > 0
     assert seen[1][0] == pytest.approx(seen[0][0], rel=1e-12)
     assert seen[1][1] == pytest.approx(seen[0][1], abs=1e-12 * np.abs(seen[0][1]).max())
+
+
+@pytest.mark.parametrize("m", [1, 3])
+def test_thickness_along_a_wave(m: int) -> None:
+    """Half the thickness changes as areas of the waved surface in space do: by cos m theta, twice by its mean."""
+    scene = two(cap(**RUBBER), cap(**RUBBER), 2 + h)
+    (term,), r = scene.model.touchings, scene.model.r0.x.array.reshape(-1, 2)
+    faces, u, nodes = term._rings, stretched(scene, 0.1 * h), term._nodes
+    U, V, W = (r[:, 0] ** (m + 1) * np.cos(k + 3 * r[:, 0] + r[:, 1]) for k in (1, 2, 3))
+    wave, along, count = np.column_stack([U, V, W]), term._curves.at_nodes, 4 * m
+    nodal = np.column_stack([r + u, wave])[nodes]
+    values, slopes = nodal, np.einsum("qk,cki->cqi", along, nodal)
+
+    def half(theta: float, e: float) -> Array:
+        cos, sin = np.cos(m * theta), np.sin(m * theta)
+        (rho, _, a, b, c), (rho1, z1, a1, b1, c1) = (np.moveaxis(each, -1, 0) for each in (values, slopes))
+        on = np.stack([rho1 + e * a1 * cos, e * b1 * sin, z1 + e * c1 * cos])
+        around = np.stack(
+            [-e * (m * a + b) * sin, rho + e * (a + m * b) * cos, -e * m * c * sin]
+        )  # along e_rho, e_theta, e_z
+        area = np.bincount(nodes.ravel(), np.linalg.norm(np.cross(on, around, axis=0), axis=0).ravel(), len(r))
+        return np.asarray(area)
+
+    off, e = r[:, 0] > 1e-9, 1e-3
+    volume = faces.half(u) * half(0.0, 0.0)
+    angles = 2 * np.pi * (np.arange(count) + 0.3) / count
+    ahead, here, back = (np.array([volume[off] / half(t, way * e)[off] for t in angles]) for way in (1, 0, -1))
+    of_wave = faces.waves(m)
+    first = of_wave.jacobian(u, off) @ wave.ravel()
+    expected = np.cos(m * angles)[:, None] * first[off]
+    assert np.abs((ahead - back) / (2 * e) - expected).max() < 1e-5 * np.abs(expected).max()
+    f = np.where(off, 1.0 + r[:, 0], 0.0)
+    second = np.mean((ahead - 2 * here + back) / e**2, axis=0) @ f[off]
+    assert wave.ravel() @ of_wave.hessian(u, f) @ wave.ravel() / 2 == pytest.approx(second, rel=1e-5)
