@@ -267,7 +267,7 @@ class MeridianTouching(ContactTerm):
         """See `InSteps`."""
         at = self._pressed()
         if self._faces:
-            moved = np.column_stack([moved, self._faces.half(self._at + moved) - self._faces.half(self._at)])
+            moved = np.column_stack([moved, self._faces.change(self._at, moved)])
         _, n, beta, nodes = self._geometry(at)
         moves = -np.einsum("nki,nki->n", slope_of(n, beta, moved.shape[1]), moved[nodes])
         deep, soft = self._h - at.distance, SOFT * self._h

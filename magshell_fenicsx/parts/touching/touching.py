@@ -306,7 +306,7 @@ class Touching(ContactTerm):
         """See `InSteps`."""
         at, joined, _ = self._pressed()
         if self._faces:
-            moved = np.column_stack([moved, self._faces.half(self._at + moved) - self._faces.half(self._at)])
+            moved = np.column_stack([moved, self._faces.change(self._at, moved)])
         _, n, beta, nodes = self._geometry(at)
         moves = -np.einsum("nki,nki->n", slope_of(n, beta, self._parts), moved[nodes])
         moves = np.bincount(joined.group, joined.weight * moves, len(joined.first))
