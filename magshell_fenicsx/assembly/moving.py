@@ -44,8 +44,17 @@ class Curve:
     corners: NDArray[np.int64]
 
     @classmethod
-    def of(cls, V: fem.FunctionSpace, facets: NDArray[np.int32], sides: Mapping[int, Side]) -> "Curve":
-        """Of the facets that this rank owns; `sides` by their numbers in a cell."""
+    def of(
+        cls,
+        V: fem.FunctionSpace,
+        facets: NDArray[np.int32],
+        sides: Mapping[int, Side],
+        pressed: Array | None = None,
+    ) -> "Curve":
+        """Of the facets that this rank owns; `sides` by their numbers in a cell.
+
+        Beside local cells that are `pressed` from inside, where that is -1, the surface is on their right.
+        """
         topology, element, dim = V.mesh.topology, V.element.basix_element, V.mesh.topology.dim
         for dims in ((dim - 1, dim), (dim, dim - 1), (dim, 0)):
             topology.create_connectivity(*dims)
@@ -62,10 +71,11 @@ class Curve:
             topology.connectivity(dim, 0).links(c)[list(sides[n][2])] for c, n in zip(cells, numbers, strict=True)
         ]
         shape = len(cells), len(weights), element.dim
+        turned = np.ones(len(cells)) if pressed is None else pressed[cells]
         return cls(
             V.dofmap.list[cells],
             np.reshape([values[n] for n in numbers], shape),
-            np.reshape([slopes[n] for n in numbers], shape),
+            turned[:, None, None] * np.reshape([slopes[n] for n in numbers], shape),
             topology.index_map(0).local_to_global(np.array(corners, dtype=np.int32).ravel()).reshape(-1, 2),
         )
 

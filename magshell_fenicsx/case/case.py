@@ -20,7 +20,7 @@ from pydantic import (
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
 from magshell_fenicsx.case.merged import expanded, written
-from magshell_fenicsx.case.shells import Several, Shells
+from magshell_fenicsx.case.shells import Part, Several, Shells
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, Later, digests, numbers_with_units
 from magshell_fenicsx.input.source import Source, read_source
@@ -123,6 +123,17 @@ class Case(WithParts):
     def several(self) -> Several | None:
         """The shells of a case that has several."""
         return self._several
+
+    def with_shells(self, parts: Sequence[Part]) -> Self:
+        """The case with its several shells as these, which differ in imperfections."""
+        assert self.several
+        several = Several(parts, self.several.joints, self.several.pairs)
+        shell = self.shell.model_copy(update={"file": several.file})
+        assert isinstance(shell, MeshSurface)
+        copied = self.model_copy(update={"shell": shell, "shells": {part.name: part.section for part in parts}})
+        copied._several = several
+        shell.files.given[shell.path] = several.assembly
+        return copied
 
     @model_serializer(mode="wrap")
     def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -133,12 +133,11 @@ def _alone(part: "Part") -> Problem | str:
     from magshell_fenicsx.case.planner import make_problem  # which finds the outlines of several shells
 
     try:
-        problem = make_problem(part.case.model_copy(update={"symmetry": "axisymmetric"}))
+        return make_problem(part.case.model_copy(update={"symmetry": "axisymmetric"}))
     except (CaseError, MeshError) as e:
         if str(e).startswith(ASKED):
             return str(e).removeprefix(ASKED)
         raise type(e)(part.refused(str(e))) from None
-    return "shell.imperfections: modes are of a shell alone" if problem.awaited else problem
 
 
 def _joined(shells: Sequence[Turned]) -> Span:

@@ -13,7 +13,6 @@ from magshell_fenicsx.case.meeting import APART, Charted, meetings
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Member
 from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, SECOND_CUT, Mirror, Sector, rotation
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shape.ground import Ground
 from magshell_fenicsx.shape.outline import ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
@@ -83,13 +82,9 @@ class Members:
         """A shell, or its half at a plane in the frame of the shell. The frame of its mesh is turned about e3."""
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
-        try:
+        with part.naming():
             problem = make_problem(part.case, plane=plane, met=self._met[part.name])
-            if problem.awaited:
-                raise CaseError("shell.imperfections: kind: modes: is of a shell alone: take another kind")
             patch = problem.triangulated()
-        except (CaseError, MeshError) as e:
-            raise type(e)(part.refused(str(e))) from None
         place = self._several.place(part)
         turned = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
         return Member(part.name, patch, turned, tuple(part.section.points))
@@ -123,7 +118,8 @@ class Members:
         """The plane in the frame of a shell that is its own image in it; else None."""
         from magshell_fenicsx.case.planner import kept  # the solver takes long to import
 
-        return kept(part.case, self._own(part, plane), loosely=loosely)
+        with part.naming():
+            return kept(part.case, self._own(part, plane), loosely=loosely)
 
     def _candidates(self, vectors: Vectors, loosely: bool) -> Iterator[Mirror]:
         """Planes that some shell has: upright ones through axes of revolution, and those of its outline."""

@@ -60,7 +60,7 @@ def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -
     whole = {key: _renamed(value, sections) if key in OF_NAMES else value for key, value in data.items()}
     whole |= {
         "shells": sections,
-        "shell": {"geometry": "mesh", "file": f"shells {several.digest[:16]}", **first},
+        "shell": {"geometry": "mesh", "file": several.file, **first},
         "boundary": {
             f"{part.name}_{name}": condition
             for part in parts

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any, get_args
 from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.shells import Part
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.sizes import MeshSection
+from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -181,7 +183,8 @@ def _replaced(part: Any, key: str, value: Any) -> Any:
 def perfect_case(case: Case) -> Case:
     """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
 
-    A pressure at its end goes on to the first instability.
+    Several shells keep their meshes, whose vertices meet at joints. A pressure at its end goes on to the first
+    instability.
 
     Raises
     ------
@@ -190,14 +193,11 @@ def perfect_case(case: Case) -> Case:
     """
     if case.dimples and case.patches:
         raise CaseError("shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named")
-    shell = case.shell
-    bare: dict[str, Any] = {"imperfections": []}
-    if "defect" in type(shell).model_fields:
-        bare["defect"] = None
-    return case.model_copy(
+    mesh = case.mesh.model_copy(update={"tolerance": None}) if case.several else MeshSection()
+    bare = case.model_copy(
         update={
-            "shell": shell.model_copy(update=bare),
-            "mesh": MeshSection(),
+            "shell": _without_imperfections(case.shell),
+            "mesh": mesh,
             "loading": _to_the_limit(case),
             "model": "shell",
             "solid": None,
@@ -205,6 +205,25 @@ def perfect_case(case: Case) -> Case:
             "stability": None,
         }
     )
+    if not case.several:
+        return bare
+    return bare.with_shells(
+        [
+            Part(
+                part.name,
+                part.section.model_copy(update={"shell": _without_imperfections(part.section.shell)}),
+                part.case.model_copy(update={"shell": _without_imperfections(part.case.shell)}),
+            )
+            for part in case.several.parts
+        ]
+    )
+
+
+def _without_imperfections(shell: Surface | ShellSection) -> Surface | ShellSection:
+    bare: dict[str, Any] = {"imperfections": []}
+    if "defect" in type(shell).model_fields:
+        bare["defect"] = None
+    return shell.model_copy(update=bare)
 
 
 def _to_the_limit(case: Case) -> Any:

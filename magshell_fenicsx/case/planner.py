@@ -25,8 +25,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
-from magshell_fenicsx.parts.imperfections.modes import ModesSection
-from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
+from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
 from magshell_fenicsx.parts.laminate import Laminated, laminate_of
 from magshell_fenicsx.parts.loads import Loads
@@ -217,16 +216,31 @@ def document_of(case: Case) -> Document:
 
 
 def _awaited(case: Case) -> Awaited | None:
-    """The modes of the perfect shell that are still to be computed."""
-    sections = [section for section in case.imperfections.values() if isinstance(section, ModesSection)]
-    awaiting = [section for section in sections if section.awaited]
+    """The modes of the perfect shell, or of several perfect ones together, that are still to be computed."""
+    several = case.several
+    parts = list(several.parts) if several else []
+    awaiting = [
+        (i, key, section)
+        for i, own in enumerate([part.case for part in parts] or [case])
+        for key, section in own.imperfections.items()
+        if isinstance(section, ModesSection) and section.awaited
+    ]
 
     def given(modes: tuple[Mode, ...]) -> Problem:
-        for section in awaiting:
-            section.become(modes)
-        return make_problem(case)
+        for i, key, section in awaiting:
+            try:
+                section.become(modes, *((parts[i].name, several.place(parts[i])) if several else ()))
+            except ValueError as e:
+                raise CaseError(parts[i].refused(f"shell.{key}.{e}")) from None
+        made = make_problem(case.with_shells(several.parts) if several else case)
 
-    count = max((len(section.amplitudes) for section in awaiting), default=0)
+        def again(values: Mapping[str, Any]) -> Problem:
+            other = made.again(values)
+            return other.awaited.given(modes) if other.awaited else other
+
+        return replace(made, remade=again)
+
+    count = max((len(section.amplitudes) for _, _, section in awaiting), default=0)
     return Awaited(count, lambda: make_problem(perfect_case(case)), given) if count else None
 
 

@@ -6,7 +6,8 @@ one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section, or_number
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly, Place
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
@@ -97,6 +100,14 @@ class Part:
         """A message of its own case, with the key in the whole case."""
         return f"shells.{self.name}.{message}"
 
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """An error of its own case within begins with its key."""
+        try:
+            yield
+        except (CaseError, MeshError) as e:
+            raise type(e)(self.refused(str(e))) from None
+
 
 class Several:
     """The shells of a case; an `Assembly` is made of them where a mesh is needed."""
@@ -114,9 +125,15 @@ class Several:
         """A hash of all from which they are made."""
         told = [
             [part.name, part.case.model_dump_json(), part.section.place.model_dump_json(), part.case.outside]
+            + [section.awaited for section in part.case.imperfections.values()]
             for part in self.parts
         ]
         return hashlib.sha256(json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()).hexdigest()
+
+    @property
+    def file(self) -> str:
+        """The name of the mesh file for which they stand."""
+        return f"shells {self.digest[:16]}"
 
     def place(self, part: Part) -> Place:
         """Where a shell is, over the R of the first one."""
@@ -147,7 +164,9 @@ class Several:
 
         factors: dict[str, Any] = {}
         for part in self.parts:
-            ratio, own = self.ratio(part), part.case.problem().thickness
+            with part.naming():
+                own = part.case.problem().thickness
+            ratio = self.ratio(part)
             factors[part.name] = ratio
             if own and own.of_position:
                 factors[part.name] = PlacedFactor(own, self.place(part), ratio)

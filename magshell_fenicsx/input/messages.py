@@ -8,7 +8,7 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any, get_args, get_origin
 
@@ -98,6 +98,8 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         keys = about[1].split(".")
         location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"
+    if kind == "dict_type":
+        said = f"must be a mapping, as {{{_example(value, location, source.data, case)}}}"
     if kind == "extra_forbidden":
         return f"{place}: {key}: {unknown(str(location[-1]), _allowed_keys(location[:-1], source.data, case))}"
     if kind == "missing":
@@ -163,8 +165,9 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     for key in loc:
         if key in NO_KEYS:
             continue
-        if not models and not named and isinstance(key, str) and key not in _at(data, kept, dict):
-            continue  # of a union of values
+        known = models[0].model_fields if len(models) == 1 else ()
+        if len(models) < 2 and not named and isinstance(key, str) and key not in {*known, *_at(data, kept, dict)}:
+            continue  # of a union of values, or of a section and a list of it
         if named:
             kept.append(key)
             named = False
@@ -175,7 +178,7 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
         kept.append(key)
         if isinstance(key, str) and models:
             field = models[0].model_fields.get(key)
-            models = _models(field.annotation) if field else []
+            models = list(dict.fromkeys(_models(field.annotation))) if field else []
             named = _has_names(field)
     return tuple(kept)
 
@@ -199,6 +202,25 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     description = meaning(section, str(location[-1])) if field else ""
     words, unit = re.split(r"[;:.,] | \[", description)[0], re.search(r"\[([^\[\]]+)\]$", description)
     return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
+
+
+def _example(value: Any, location: Location, data: Any, case: type[BaseModel]) -> str:
+    """How a mapping begins that was written as a word or a list of words."""
+    field = _found(location, data, case)[1]
+    parts = _parts(field.annotation if field else None)
+    keys, of = next((get_args(part) for part in parts if get_origin(part) is dict), (str, str))
+    words = value if isinstance(value, list) else [value]
+    named = [word for word in words if isinstance(word, str) and word.isidentifier()]
+    first = named or [*get_args(keys), "NAME"]
+    what = next((part for part in _parts(of) if isinstance(part, str)), "...")
+    return f"{first[0]}: {what}"
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """An annotation and all within it."""
+    yield annotation
+    for part in get_args(annotation):
+        yield from _parts(part)
 
 
 def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:

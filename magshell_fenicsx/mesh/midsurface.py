@@ -74,8 +74,17 @@ class Midsurface:
     _patch: PatchMesh
 
     def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart."""
+        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart.
+
+        Of several shells, and of a mesh file, they are places in space.
+        """
         return self._charted(compat.interpolation_points(V))[..., :3]
+
+    def charted_by_shell(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
+        """The same, of several shells that have charts in that of each cell's shell, where others may be too."""
+        if not getattr(self._patch.embedding, "charts", False):
+            return self.charted(V)
+        return self._charted(compat.interpolation_points(V))[..., 3:5]
 
     def _charted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same at reference points (q, 2), with the normals of a mesh file that has imperfections."""

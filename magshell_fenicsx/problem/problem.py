@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
-from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
+from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.part import Context

@@ -29,7 +29,7 @@ from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_f
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells
+from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells, side_of
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import supports
 from magshell_fenicsx.parts.supports.supports import held_on
@@ -305,8 +305,10 @@ class MeridianModel(Thin):
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
-            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=not self.meridian.begins(name))
+            Lid.over_ring(
+                self.meridian.section(np.array([s]))[0, 0], motions, last=(side > 0) != self.meridian.begins(name)
+            )
             for name, s in ends.items()
-            if (motions := motions_of(self.loads, name))
+            if (side := side_of(name, self.loads.pressed)) and (motions := motions_of(self.loads, name))
         ]
         return Pressed(PRESSURE, self.material.classical_pressure / self.material.h, lids)

@@ -43,7 +43,7 @@ from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import beside, on_cells, openings
+from magshell_fenicsx.parts.pressure.openings import beside, on_cells, on_each, openings
 from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
 from magshell_fenicsx.parts.supports.supports import (
     closing_point,
@@ -269,8 +269,8 @@ class ShellModel(Thin):
         if closed:
             in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
             curves = {
-                name: Curve.of(V, side, triangle_sides())
-                for name, side in midsurface.edges.items()
+                name: Curve.of(V, side, triangle_sides(), pressed and on_each(pressed))
+                for name, side in open_at.items()
                 if name in in_planes or motions_of(loads, name)
             }
             unit = material.classical_pressure / material.h
@@ -361,7 +361,14 @@ class ShellModel(Thin):
 
     def chart(self) -> NDArray[np.float64]:
         """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""
-        cells, nodes, index_map = self.midsurface.charted(self.V), self.V.dofmap.list, self.V.dofmap.index_map
+        return self._at_nodes(self.midsurface.charted(self.V))
+
+    def chart_by_shell(self) -> NDArray[np.float64]:
+        """The same, of several shells that have charts in that of each node's shell."""
+        return self._at_nodes(self.midsurface.charted_by_shell(self.V))
+
+    def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
         coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
         np.minimum.at(coordinates, nodes, cells)  # the first of the two positions of a node on a seam
         return coordinates[: index_map.size_local]

@@ -61,7 +61,9 @@ def number_of(context: Context, key: str) -> float:
     geometry = section == "shell" and rest.split(".")[0] not in (*OF_MATERIAL, *OF_DEVIATION)
     if section in ELSEWHERE or geometry:
         raise CaseError(f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here")
-    if any(section.of_perfect_shell for section in (context.sections.get("imperfections") or {}).values()):
+    flaws = [*(context.sections.get("imperfections") or {}).values()]
+    flaws += [flaw for each in (context.sections.get("shells") or {}).values() for flaw in each.shell.imperfections]
+    if any(flaw.of_perfect_shell for flaw in flaws) and ".imperfections." not in key:
         raise CaseError(
             f"{key}: the modes of the perfect shell, which the case has as imperfections, change with it: give their "
             "file (kind: modes, file)"

@@ -8,10 +8,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.modes import ModesNotFound
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
-from magshell_fenicsx.parts.imperfections.modes import Mirrored, Shape, on_meridian, on_surface
+from magshell_fenicsx.parts.imperfections.modes import (
+    Mirrored,
+    Mode,
+    OfShells,
+    Shape,
+    on_meridian,
+    on_surface,
+    over_largest,
+)
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
@@ -20,13 +27,15 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import LOCATED
+from magshell_fenicsx.simulate.transfer import all_of_shells, nodes_of_shells
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-_known: dict[str, tuple[Shape, ...]] = {}  # a sweep has many cases with one perfect shell
+STILL = 1e-6  # of the largest displacement: a shell that moves less is not moved by the mode
+_known: dict[str, tuple[Mode, ...]] = {}  # a sweep has many cases with one perfect shell
 
 
 def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
@@ -48,7 +57,7 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
     return problem.awaited.given(_known[this])
 
 
-def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
+def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, ...]:
     """The lowest modes of a shell at its first instability, or at the end of its history without one; collective."""
     scene = Scene(problem, comm)
     state = scene.unloaded()
@@ -67,32 +76,52 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Shape, 
         raise CaseError(f"shell.imperfections: the modes of the perfect shell are not found: {e}") from None
     if len(modes) < count:
         raise CaseError(f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not {count}")
-    return tuple(_shape(scene, state, mode) for mode in modes)
+    return tuple(_shape(scene, mode) for mode in modes)
 
 
-def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
-    model = scene.model
+def _shape(scene: Scene, mode: ShellMode) -> Mode:
+    """One function of the place, or of several shells one for each that it moves."""
+    model, mirror = scene.model, None
     if model.axisymmetric:
-        return _wave(model, mode)
-    assert model.thin
-    x, w = _at_nodes(scene, model, mode)
-    if model.multiplicity == 1:
-        return on_surface(x, w, x)
-    sign, mirror = -1.0 if mode.label == "antisymmetric" else 1.0, model.mirror
-    whole = on_surface(np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w]), x)
-    return in_frame(Mirrored(whole, mirror, sign), -scene.problem.azimuth)
+        (x, w), order = _along_meridian(model, mode), np.argsort(model.V.tabulate_dof_coordinates()[:, 0])
+        inside = [of[order] for of in nodes_of_shells(scene)]
+    else:
+        assert model.thin
+        (x, w), inside = _at_nodes(scene, model, mode), all_of_shells(scene)
+        mirror = model.mirror if model.multiplicity > 1 else None
+    own, sign = len(x), -1.0 if mode.label == "antisymmetric" else 1.0
+    if mirror:
+        x, w = np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w])
+    w = over_largest(x, w)
+
+    def part(of: NDArray[np.int64]) -> Shape:
+        if model.axisymmetric:
+            return on_meridian(x[of], w[of], int(mode.label.removeprefix("m = ") or 0))
+        if not mirror:
+            return on_surface(x[of], w[of], x[of])
+        both = np.concatenate([of, own + of])
+        whole = on_surface(x[both], w[both], x[of])
+        return in_frame(Mirrored(whole, mirror, sign), -scene.problem.azimuth)
+
+    of_each = [np.flatnonzero(of) for of in inside]
+    if len(of_each) < 2:
+        return part(of_each[0])
+    named = zip(scene.problem.context.sections["shells"], of_each, strict=True)
+    return OfShells({name: part(of) for name, of in named if np.abs(w[of]).max() > STILL})
 
 
-def _wave(model: "MeridianModel", mode: ShellMode) -> Shape:
-    """From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode."""
-    m = int(mode.label.removeprefix("m = ") or 0)
-    V = model.waves.V if m else model.V
+def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:
+    """All nodes (n, 3) and the inward displacements (n,) there, in their order along it.
+
+    From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode.
+    """
+    V = model.waves.V if mode.label else model.V
     order, own = (np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V))
     values = mode.vector.reshape(len(order), -1)[order]
-    along = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if m else values
+    along = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if mode.label else values
     normal = nodal_normals(model.r0)[own][:, [0, 2]]
     rho, z = model.r0.x.array.reshape(-1, 2)[own].T
-    return on_meridian(rho, z, -np.einsum("ij,ij->i", along, normal), m)
+    return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", along, normal)
 
 
 def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:

@@ -155,23 +155,28 @@ def of_shells(source: Scene, target: Scene) -> Iterator[tuple[NDArray[np.bool_],
 
     Shells that touch are near each other, and move in different ways. Collective.
     """
-    comm = source.model.system.comm
-    of_all = [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(source)]
-    return zip(of_all, nodes_of_shells(target), strict=True)
+    return zip(all_of_shells(source), nodes_of_shells(target), strict=True)
+
+
+def all_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
+    """Which of the nodes of all ranks are of each shell; collective."""
+    return [np.concatenate(scene.comm.allgather(inside)) for inside in nodes_of_shells(scene)]
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     """Which of this rank's nodes are of each shell, one for all of a shell alone."""
+    model = scene.model
+    nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
+    return [np.isin(np.arange(count), nodes[np.flatnonzero(cells)].ravel()) for cells in cells_of_shells(scene)]
+
+
+def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
+    """Which of this rank's cells, with ghosts, are of each shell, one for all of a shell alone."""
     model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
-    count = model.system.size // model.V.dofmap.bs
     if len(names) < 2:
-        return [np.ones(count, dtype=bool)]
+        return [np.ones(len(model.V.dofmap.list), dtype=bool)]
     patches = model.meridian.patches if model.axisymmetric else model.midsurface.patches if model.midsurface else {}
-    found = list[NDArray[np.bool_]]()
-    for name in names:
-        nodes = model.V.dofmap.list[np.flatnonzero(patches[name])].ravel()
-        found.append(np.isin(np.arange(count), nodes))
-    return found
+    return [patches[name] for name in names]
 
 
 def _all_nodes(scene: Scene) -> Array:

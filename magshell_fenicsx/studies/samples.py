@@ -57,16 +57,17 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, 
     section = made(source).ensemble
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
-    if section.defects and source.data.get("shells"):
-        raise CaseError(
-            "ensemble.defects: are of a shell alone: give keys, shells.NAME.shell.imperfections.0.amplitude"
-        )
+    shells = list(source.data.get("shells") or ())
+    try:
+        section.refuse_unfit(shells)
+    except ValueError as e:
+        raise CaseError(str(e)) from None
     refuse_unknown_keys(source, section, made)
     samples = []
     for number in numbers:
         drawn = dict[str, str]()
         try:
-            drawn = section.settings(seed, number)
+            drawn = section.settings(seed, number, shells)
             samples.append(_sample(source, number, drawn, made, deleted))
         except (CaseError, NoRoom) as e:
             message = in_the_file(str(e), source, {key: text for key, text in drawn.items() if key in section.keys})

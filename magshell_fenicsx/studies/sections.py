@@ -1,6 +1,7 @@
 """The sections of studies in a case: what a design varies and wants, and what is random in an ensemble."""
 
 import json
+from collections.abc import Collection
 from typing import Annotated, Any, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -231,26 +232,67 @@ class DesignSection(Section):
         return list(dict.fromkeys([*self.objective.results, *limited]))
 
 
+class PlacedDefectsSection(DefectsSection):
+    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in area."""
+
+    on: str | None = None
+    """Name of one of several shells, over whose thickness they are; by default each has as many of its own"""
+
+
+IMPERFECTIONS = "shell.imperfections"
+
+
 class EnsembleSection(Section):
     """What is random in the samples of `magshell ensemble`; every other command takes the case without it."""
 
     keys: dict[str, Distribution] = Field(default_factory=dict)
     """Key of the case, with dots (`magnetic.lambda_m`, `shell.imperfections.0.amplitude`) -> its distribution"""
-    defects: DefectsSection | None = None
-    """Random defects of a sphere"""
+    defects: (
+        Annotated[
+            Annotated[PlacedDefectsSection, Tag("one")]
+            | Annotated[list[PlacedDefectsSection], Tag("several"), Field(min_length=1)],
+            Discriminator(lambda data: "several" if isinstance(data, list) else "one"),
+        ]
+        | None
+    ) = None
+    """Random defects of a sphere, or a list of these: for different shells, or of different kinds"""
 
     @model_validator(mode="after")
     def _something_is_random(self) -> Self:
         if not self.keys and self.defects is None:
             raise ValueError("needs keys or defects: otherwise nothing is random")
-        if self.defects and (key := next((key for key in self.keys if key.startswith("shell.imperfections")), None)):
-            raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
+        taken = tuple(f"shells.{on}.{IMPERFECTIONS}" if on else IMPERFECTIONS for on in self._on)
+        for key in self.keys:
+            if key.startswith(taken) or (None in self._on and f".{IMPERFECTIONS}" in key):
+                raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
         return self
 
-    def settings(self, seed: int, number: int) -> dict[str, str]:
+    @property
+    def _listed(self) -> list[PlacedDefectsSection]:
+        return self.defects if isinstance(self.defects, list) else [self.defects] if self.defects else []
+
+    @property
+    def _on(self) -> list[str | None]:
+        return [each.on for each in self._listed]
+
+    def refuse_unfit(self, shells: Collection[str]) -> None:
+        """See that the case has the shells that have defects; raises ValueError otherwise."""
+        for name in self._on:
+            if name and not shells:
+                raise ValueError("ensemble.defects.on: names one of several shells: leave it out")
+            if name and name not in shells:
+                raise ValueError(f"ensemble.defects.on: {name}: there is no such shell, only {', '.join(shells)}")
+
+    def settings(self, seed: int, number: int, shells: Collection[str] = ()) -> dict[str, str]:
         """The keys of a sample and their values, as in `--set`; they depend on seed and number alone.
 
-        Every key has random numbers of its own: another key more does not change the others.
+        Every key has random numbers of its own: another key more does not change the others. The first shell with
+        defects has those that it has alone.
+
+        Parameters
+        ----------
+        shells
+            Names of several shells.
 
         Raises
         ------
@@ -260,6 +302,12 @@ class EnsembleSection(Section):
         drawn: dict[str, Value | list[Any]] = {
             key: distribution.draw(generator(seed, number, key)) for key, distribution in self.keys.items()
         }
-        if self.defects:
-            drawn["shell.imperfections"] = self.defects.draw(generator(seed, number, "shell.imperfections"))
+        defects = dict[str, list[Any]]()
+        named = [(each, name) for each in self._listed for name in ([each.on] if each.on else [*shells] or [""])]
+        for i, (each, name) in enumerate(named):
+            key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
+            before = sum(other == name for _, other in named[:i])
+            of_its_own = (f"{key}.{before}" if before else key) if i else IMPERFECTIONS
+            defects.setdefault(key, []).extend(each.draw(generator(seed, number, of_its_own)))
+        drawn |= defects
         return {key: json.dumps(value) for key, value in drawn.items()}

@@ -162,7 +162,9 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     from scipy.stats import pearsonr, spearmanr
 
     correlated = {}
-    drawn = [key for key in drawn_keys(rows) if not key.startswith("shell.imperfections.")]
+    place, keys = "at.polar", drawn_keys(rows)
+    of_defects = "shell.imperfections.", *(key.removesuffix(place) for key in keys if key.endswith(f".{place}"))
+    drawn = [key for key in keys if not key.startswith(of_defects)]
     for key in (*severest_keys(rows), *drawn):
         pairs = np.array(
             [(x, y) for row in rows if isinstance(x := row.get(key), float | int) and (y := row[RESULT]) is not None]

@@ -24,6 +24,7 @@ magnetic:
 loading: {kind: pressure, control: arc, until: target, pressure: 100 Pa}
 """
 MAGNET = "magnetic.applied.sources.0"
+DEFECTS = "count: 1, amplitude: 1, width: 1, polar: [0, 10]"
 MISTAKES = [
     # a wrong shell is no reason to complain of a target with a unit
     ("shell.polar=200", "shell.polar: 200: must be less than or equal to 179"),
@@ -42,6 +43,12 @@ MISTAKES = [
     (f"{MAGNET}.polarization=[1 T, 2, 3 T]", f'{MAGNET}.polarization.1: 2: needs a unit, for example "60 mT"'),
     (f"{MAGNET}.position=[60 mm, 0]", f"{MAGNET}.position: ['60 mm', 0]: must have at least 3 items, not 2"),
     ("magnetic.applied.sources.1.height=1", "magnetic.applied.sources.1: the list has items 0 to 0"),
+    ("loading={kind: pressure, on: upper}", "loading.on: 'upper': must be a mapping, as {upper: outside} (Name of one"),
+    ("points=[tip]", "points: ['tip']: must be a mapping, as {tip: ...} (Name -> place"),
+    (
+        f"ensemble={{defects: {{{DEFECTS}, on: [upper]}}}}",
+        "ensemble.defects.on: ['upper']: must be a valid string (Name of one of several",
+    ),
     ("shell.thickness_factor=[2]", "shell.thickness_factor: [2]: must be a valid string (Multiplies h)"),
     (
         'magnetic.remanent={kind: expression, flux_density: 60 mT, components: ["x", "y", "q"]}',

@@ -48,6 +48,37 @@ def test_far_apart() -> None:
     assert seen["lower_tip_uz"] == pytest.approx(alone["tip_uz"], rel=1e-10)
 
 
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+def test_pressure_beside_edges_that_move(symmetry: str) -> None:
+    """One of two rings is pressed while its inner edge is lifted: energy, volume and reactions as alone, 1e-9.
+
+    From inside they are those of the negative pressure. The lift of a shell that is not pressed does not feel it.
+    """
+    ring = {"shell": {"geometry": "cap", "radius": 1, "polar": 40, "hole": 10, "thickness": 0.03, "poisson_ratio": 0.3}}
+    ring |= {"boundary": {"rim": "clamped", "hole": "clamped"}}
+    shells = {"lower": ring, "upper": ring | {"place": {"position": [0, 0, 5]}}}
+
+    def lifted(data: dict[str, Any], edge: str, pressure: float, **on: Any) -> dict[str, float]:
+        press = {"kind": "pressure", "control": "load", "until": "target", "pressure": pressure, "points": 1}
+        lift = {"kind": "edge", "name": "lift", "points": 1}
+        lift["moves"] = [{"supports": [edge], "translation": [0, 0, 0.02]}]
+        mesh = {"mesh": {"degree": 3, "refinement": 0.5}, "symmetry": symmetry}
+        return end(data | mesh | {"loading": [press | on, lift]})[2]
+
+    def same(seen: dict[str, float], alone: dict[str, float], side: float) -> None:
+        for key in ("energy", "reaction", "hole_fz", "rim_fz"):
+            there = seen[key if key in seen else f"upper_{key}"]
+            assert there == pytest.approx(alone[key], rel=1e-9), key
+        assert seen["volume_change"] == pytest.approx(side * alone["volume_change"], rel=1e-9)
+
+    for face, side in (("outside", 1.0), ("inside", -1.0)):
+        seen = lifted({"shells": shells}, "upper.hole", 0.2, on={"upper": face})
+        same(seen, lifted(ring, "hole", 0.2 * side), side)
+    apart = lifted({"shells": shells}, "upper.hole", 0.2, on={"lower": "inside"})
+    assert apart["reaction"] == pytest.approx(apart["upper_hole_fz"], rel=1e-9)
+    assert apart["reaction"] == pytest.approx(lifted(ring, "hole", 1e-9)["reaction"], rel=1e-7)
+
+
 def test_sizes() -> None:
     """One with another radius and thickness is as it is alone; numbers are over R and h of the first: 1e-5."""
     upper = cap(radius=1.5, thickness=0.01) | {"points": {"tip": [0, 0, 1.5]}}

@@ -88,6 +88,58 @@ def test_modes_of_half_and_full_shells() -> None:
     )
 
 
+CAP = {"geometry": "cap", "radius": 1, "polar": 40, "poisson_ratio": 0.3}
+
+
+def of(data: dict[str, Any]) -> Case:
+    return Case.from_source(Source("case.yaml", data))
+
+
+def test_modes_of_several_shells() -> None:
+    """The thinner of two caps apart, upside down, buckles as it does alone, 1e-8, and the other one stays.
+
+    Its mode, m = 4, has crests where the troughs are of one that is not upside down.
+    """
+
+    def one(thickness: float, *amplitudes: float, **place: Any) -> dict[str, Any]:
+        items = [{"kind": "modes", "amplitudes": list(amplitudes)}] if amplitudes else []
+        shell = CAP | {"thickness": thickness, "imperfections": items}
+        return {"shell": shell, "boundary": {"rim": "clamped"}} | place
+
+    def two(upper: dict[str, Any]) -> Case:
+        return of({"shells": {"lower": lower, "upper": upper}, "loading": {"kind": "pressure"}})
+
+    lower, place = one(0.03), {"place": {"position": [0, 0, 5], "axis": {"polar": 180}}}
+    alone = run(of(one(0.02, 0.2) | {"loading": {"kind": "pressure"}})).knockdown
+    together = run(two(one(0.02, 0.2, **place))).knockdown
+    assert alone
+    assert together
+    assert together == pytest.approx(alone * (0.02 / 0.03) ** 2, rel=1e-8)
+    lower = one(0.03, 0.2)
+    with pytest.raises(CaseError, match=r"shells\.lower\.shell\.imperfections\.0\.amplitudes: of the 1 lowest modes"):
+        run(two(one(0.02, **place)))
+
+
+def test_modes_of_shells_that_are_joined() -> None:
+    """A column of two plates, each with its part of the mode, bends as one plate with it does: 1e-3, by the mesh."""
+
+    def plate(length: float, **keys: Any) -> dict[str, Any]:
+        size = {"length": length, "width": 0.3, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0.3}
+        flaw = {"imperfections": [{"kind": "modes", "amplitudes": [0.1]}]}
+        return {"shell": {"geometry": "plate", **size, **flaw}} | keys
+
+    def pushed(edge: str) -> dict[str, Any]:
+        force = {"edge": edge, "force": [-1, 0, 0]}
+        return {"loading": {"kind": "dead", "control": "load", "loads": [force], "factor": 5e-8, "points": 1}}
+
+    root = {"boundary": {"left": "clamped"}}
+    whole = run(of(plate(2, points={"tip": [2, 0, 0]}) | root | pushed("right"))).rows[-1]
+    parts = {"one": plate(1) | root, "two": plate(1, points={"tip": [1, 0, 0]}, place={"position": [1, 0, 0]})}
+    joint = {"joints": [{"edges": ["one.right", "two.left"], "kind": "rigid"}]}
+    joined = run(of({"shells": parts} | joint | pushed("two.right"))).rows[-1]
+    assert abs(joined["two_tip_uz"]) == pytest.approx(abs(whole["tip_uz"]), rel=1e-3)
+
+
 def test_amplitudes_are_parameters() -> None:
     found = changed(case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05)["imperfections.0"]
     assert isinstance(found, ModesSection)

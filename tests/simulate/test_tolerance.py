@@ -19,7 +19,7 @@ from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, equidistributed
-from magshell_fenicsx.simulate.adapt.ending import CellFields, NoResult, NotCarried, by_path, carry, from_near
+from magshell_fenicsx.simulate.adapt.ending import CellFields, NoResult, NotCarried, by_path, carry, from_near, near_by
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
 FORCE = 15.14768
@@ -85,6 +85,37 @@ def test_grading_by_the_indicator_takes_fewer_unknowns() -> None:
     error = abs(from_near(scene, near, by_path(near)).value / KNOCKDOWN[lambda_m] - 1)
     assert graded.best.dofs < 0.85 * scene.model.system.dofs
     assert abs(graded.best.result / KNOCKDOWN[lambda_m] - 1) < error
+
+
+def dome(thickness: float, height: float, **shell: object) -> dict[str, object]:
+    keys = {"geometry": "cap", "radius": 1, "polar": 40, "thickness": thickness, "poisson_ratio": 0.3}
+    return {"shell": keys | shell, "boundary": {"rim": "clamped"}, "place": {"position": [0, 0, height]}}
+
+
+def test_ends_of_several_shells_are_carried() -> None:
+    """Each gives its own to itself, though they cross in space: exact to a higher degree, and the fold of its path."""
+    flaw = {"kind": "gaussian", "amplitude": 0.5, "width": 1.5, "at": {"polar": 10}}
+    shells = {"lower": dome(0.03, 0.0, imperfections=[flaw]), "upper": dome(0.04, 0.01)}
+    case = Case.from_source(Source("test", {"shells": shells, "loading": {"kind": "pressure", "until": "limit"}}))
+    low, high, finer = (Choice(*each).scene(case.problem(), COMM) for each in ((3, 0.4), (4, 0.4), (4, 0.6)))
+    end = by_path(low)
+    assert carry(high, low, carry(low, high, end.state.u)) == pytest.approx(end.state.u, abs=1e-9)
+    found = near_by(finer, low, end)
+    assert found
+    assert found.value == pytest.approx(by_path(finer).value, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_ends_of_shells_that_touch_are_carried() -> None:
+    """With cuts and penalties of their own, which the path changes elsewhere: its force, 8.80658e-6, to 1e-3.
+
+    From a coarser mesh than this Newton's method does not reach the end, and the path is computed anew.
+    """
+    case = Case.load(CASES / "stacked_domes.yaml", ["loading.displacement=0.1", "mesh={degree: 3, refinement: 0.722}"])
+    low, finer = (Choice(degree, 0.722).scene(case.problem(), COMM) for degree in (3, 4))
+    found = near_by(finer, low, by_path(low))
+    assert found
+    assert found.value == pytest.approx(8.80658e-6, rel=1e-3)
 
 
 def test_displacements_are_carried_to_a_higher_degree_without_loss() -> None:

@@ -8,9 +8,12 @@ from typing import Any
 import pytest
 import yaml
 from command import magshell
+from many import make_samples
 
-from magshell_fenicsx import Case
+from magshell_fenicsx import Case, CaseError
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import run
+from magshell_fenicsx.studies.samples import Sample
 
 CAP = {
     "geometry": "cap",
@@ -49,6 +52,11 @@ def written(folder: Path, **keys: Any) -> Path:
     file = folder / "case.yaml"
     file.write_text(str(two(**keys)).replace("'", '"'), encoding="utf-8")  # JSON, which is YAML
     return file
+
+
+def drawn(case: dict[str, Any]) -> list[Sample]:
+    """Two samples of a case."""
+    return make_samples(Source("case", case), 1, range(2))
 
 
 def rows_of(file: Path) -> list[dict[str, str]]:
@@ -91,10 +99,39 @@ def test_ensemble(tmp_path: Path) -> None:
         assert float(row["severest.amplitude"]) == amplitude
         flaw = {"imperfections": [FLAW["imperfections"][0] | {"amplitude": amplitude}]}
         assert float(row["result"]) == pytest.approx(alone(**flaw), rel=1e-9)
-    case = written(tmp_path, ensemble={"defects": {"count": 3, "amplitude": draw, "width": 0.2, "polar": [0, 10]}})
-    done = magshell("ensemble", case, "--samples", 1, "--seed", 1, "--out", tmp_path / "refused")
-    assert done.returncode == 2
-    assert "ensemble.defects: are of a shell alone" in done.stderr
+
+
+def test_random_defects(tmp_path: Path) -> None:
+    """The first shell has the defects that it has alone, by the same seed; the other one has others: 1e-9."""
+    draw = {"kind": "uniform", "above": 0.1, "below": 0.8}
+    defects = {"count": 2, "amplitude": draw, "width": 1.5, "polar": [0, 10]}
+    case = written(tmp_path, symmetry="none", ensemble={"defects": defects})
+    out = tmp_path / "out"
+    done = magshell("ensemble", case, "--samples", 2, "--seed", 1, "--result", "lower_tip_uz_mm@end", "--out", out)
+    assert done.returncode == 0, done.stderr
+    bare = one() | {"mesh": MESH, "loading": LOAD, "symmetry": "none", "ensemble": {"defects": defects}}
+    for row, sample in zip(rows_of(out / "samples.csv"), drawn(bare), strict=True):
+        values = {f"shells.lower.{key}": value for key, value in sample.values.items()}
+        assert {key: float(row[key]) for key in values} == values
+        tip = run(sample.case).rows[-1]["tip_uz_mm"]
+        assert float(row["result"]) == pytest.approx(tip, rel=1e-9)
+        other = [float(value) for key, value in row.items() if key.startswith("shells.upper.shell.imperfections")]
+        assert len(other) == len(values)
+        assert not {*other} & {*values.values()} - {1.5}
+    on_upper = [defects | {"on": "upper"}, defects | {"on": "upper", "kind": "dimple", "count": 1}]
+    there = drawn(two(symmetry="none", ensemble={"defects": on_upper}))
+    for sample, alone_there in zip(there, drawn(bare), strict=True):
+        upper = {key.removeprefix("shells.upper."): value for key, value in sample.values.items()}
+        assert alone_there.values.items() <= upper.items()
+        assert [each.kind for each in sample.case.shells["upper"].shell.imperfections] == [*2 * ["gaussian"], "dimple"]
+    for name, case_of, said in (
+        ("lowest", two, "lowest: there is no such shell, only lower, upper"),
+        ("lower", lambda **keys: bare | keys, "names one of several shells: leave it out"),
+    ):
+        with pytest.raises(CaseError, match=f"ensemble.defects.on: {said}"):
+            drawn(case_of(ensemble={"defects": defects | {"on": name}}))
+    with pytest.raises(CaseError, match="defects take the place of shell"):
+        drawn(two(ensemble={"keys": {"shells.lower.shell.imperfections.0.amplitude": draw}, "defects": defects}))
 
 
 def test_gradients(tmp_path: Path) -> None:

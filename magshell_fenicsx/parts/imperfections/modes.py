@@ -1,6 +1,6 @@
 """Modes of the perfect shell as imperfections."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import TYPE_CHECKING, Annotated, Literal, Self
@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
 from magshell_fenicsx.platform.reading import vtk_data
@@ -30,7 +31,8 @@ class ModesSection(FileKeys, ImperfectionSection):
     """The lowest modes of the perfect shell where it first becomes unstable under the case's loads.
 
     A pressure goes on to there, whatever its target; under other loads without an instability they are those at the
-    end. Of each its displacement along the normal, inwards positive, over the largest one.
+    end. Of each its displacement along the normal, inwards positive, over the largest one. Of several shells they are
+    the modes of all together, perfect, and each has its part: the largest one may be on another shell.
     """
 
     kind: Literal["modes"]
@@ -69,9 +71,28 @@ class ModesSection(FileKeys, ImperfectionSection):
     def of_perfect_shell(self) -> bool:
         return self.file is None
 
-    def become(self, shapes: tuple[Shape, ...]) -> None:
-        """Take the modes of the perfect shell."""
-        self._shapes = shapes[: len(self.amplitudes)]
+    def become(self, modes: "Sequence[Mode]", name: str = "", place: Place | None = None) -> None:
+        """Take the modes of the perfect shell, or the parts of the shell `name` in those of several.
+
+        Raises
+        ------
+        ValueError
+            If no mode with an amplitude moves the shell.
+        """
+
+        def own(mode: Mode) -> Shape | None:
+            if not isinstance(mode, OfShells):
+                return mode
+            return Placed(mode.parts[name], place) if place and name in mode.parts else None
+
+        parts = [own(mode) for mode in modes[: len(self.amplitudes)]]
+        counted = [part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude]
+        if counted and not any(counted):
+            raise ValueError(
+                f"amplitudes: of the {len(parts)} lowest modes of all shells together those with an amplitude do not "
+                "move it: give more, and 0 for those of other shells"
+            )
+        self._shapes = tuple(part or _still for part in parts)
 
     def flaw(self, ground: Ground, key: str) -> Flaw:
         """See `ImperfectionSection`; modes that are not yet computed are zero.
@@ -86,7 +107,8 @@ class ModesSection(FileKeys, ImperfectionSection):
             self.become((_read(self, ground.perfect.sample(), f"{key}.file: {self.file}"),))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
-        names = [f"mode {i}{f' (m = {s.m})' if isinstance(s, Round) else ''}" for i, s in enumerate(shapes, 1)]
+        waves = [getattr(shape, "m", None) for shape in shapes]
+        names = [f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(waves, 1)]
         words = [f"{a:g} h of {self.file or name}" for a, name in zip(self.amplitudes, names, strict=False)]
         account = ", ".join(words) or "modes that the run computes"
         return Flaw(Modes(shapes, amplitudes), SHOWN * sqrt(h), account=account)
@@ -131,20 +153,48 @@ class Mirrored:
         return np.asarray(self.shape(on_this_side) * np.where(beyond, self.sign, 1.0))
 
 
+def _still(places: Array) -> Array:
+    return np.zeros(len(places))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A mode in the frame of a shell that has its place among others."""
+
+    shape: Shape
+    place: Place
+
+    def __call__(self, places: Array) -> Array:
+        return self.shape(self.place(places))
+
+    @property
+    def m(self) -> int | None:
+        """The number of waves around e3, of one that has it."""
+        return getattr(self.shape, "m", None)
+
+
+@dataclass(frozen=True)
+class OfShells:
+    """A mode of several shells together: of each that it moves its part, by name."""
+
+    parts: Mapping[str, Shape]
+
+
+Mode = Shape | OfShells
+
+
 def on_surface(places: Array, w: Array, cover: Array) -> "Scattered":
-    """A mode from its inward displacements (n,) at places (n, 3), scaled to 1."""
+    """A mode from its inward displacements (n,), over the largest, at places (n, 3)."""
     from magshell_fenicsx.mesh.scattered import scattered
 
-    return scattered(places, np.asarray(w / _largest(places, w)), cover, noise=0)
+    return scattered(places, w, cover, noise=0)
 
 
-def on_meridian(rho: Array, z: Array, w: Array, m: int) -> Round:
-    """A wave around e3 from its inward displacements (n,) along the meridian, with its parity across the axis."""
+def on_meridian(places: Array, f: Array, m: int) -> Round:
+    """A wave around e3 from these displacements (n,) at places (n, 3) of the meridian, with its parity across e3."""
     from magshell_fenicsx.mesh.scattered import scattered
 
-    places = np.column_stack([rho, 0 * z, z])
-    f = np.asarray(w / _largest(places, w))
-    if rho.min() < ON_AXIS:
+    if places[:, 0].min() < ON_AXIS:
         places, f = np.vstack([places, places * [-1.0, 1.0, 1.0]]), np.concatenate([f, (-1) ** m * f])
     return Round(scattered(places, f, places, noise=0), m)
 
@@ -162,12 +212,12 @@ def _read(section: ModesSection, sample: Array, key: str) -> "Scattered":
         raise CaseError(f"{key}: the mode has no finite displacement")
     if scipy.spatial.cKDTree(r0).query(sample)[0].max() > BESIDE:
         raise CaseError(f"{key}: is the mode of another shell: it does not reach all places of this one")
-    return on_surface(r0, w, sample)
+    return on_surface(r0, over_largest(r0, w), sample)
 
 
-def _largest(places: Array, w: Array) -> float:
-    """The largest value with its sign; of equally large ones that of the highest place, whatever their order."""
+def over_largest(places: Array, w: Array) -> Array:
+    """Values over the largest one with its sign; of equally large ones that of the highest place, in any order."""
     size = np.abs(w)
     near = np.flatnonzero(size > (1 - EQUAL) * size.max())
     first = near[np.lexsort(places[near].round(6).T)[-1]]
-    return float(np.copysign(size.max(), w[first]))
+    return np.asarray(w / np.copysign(size.max(), w[first]))

@@ -6,7 +6,7 @@ motions v and w of the edge (Romano 1972, Buefler 1984, Schweizerhof and Ramm 19
 a single direction or in its own plane: then the pressure has a potential, `densities.swept`. Elsewhere it has none.
 """
 
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 
 import numpy as np
 from dolfinx import fem
@@ -103,25 +103,33 @@ def on_cells(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> f
     return pressed
 
 
+def on_each(pressed: fem.Function) -> Array:
+    """The same as an array (cells,)."""
+    return np.asarray(pressed.x.array[pressed.function_space.dofmap.list[:, 0]])
+
+
 def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dict[str, NDArray[np.int32]]:
     """The parts of edges, facets on this rank, whose cells are pressed."""
-    Q = pressed.function_space
-    topology = Q.mesh.topology
+    topology, sides = pressed.function_space.mesh.topology, on_each(pressed)
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
 
     def acts(facet: int) -> bool:
-        return bool(pressed.x.array[Q.dofmap.list[links.links(facet)[0]]].any())
+        return bool(sides[links.links(facet)[0]])
 
     return {name: facets[np.array([acts(f) for f in facets], dtype=bool)] for name, facets in edges.items()}
 
 
+def side_of(end: str, on: Mapping[str, float]) -> float:
+    """The side on which a pressure acts on the shell of an end, as of `on_cells`; without `on` all from outside."""
+    return next((side for shell, side in on.items() if end.startswith(f"{shell}_")), 0.0) if on else 1.0
+
+
 def ring_openings(
-    ends: Mapping[str, Array], conditions: Mapping[str, Condition], on: Collection[str] = ()
+    ends: Mapping[str, Array], conditions: Mapping[str, Condition], on: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """The same of a meridian with ends at (rho, z); `on` are the shells that the pressure acts on, all without."""
-    if on:
-        ends = {name: at for name, at in ends.items() if any(name.startswith(f"{shell}_") for shell in on)}
+    """The same of a meridian with ends at (rho, z), of shells that a pressure acts on, see `side_of`."""
+    ends = {name: at for name, at in ends.items() if side_of(name, on)}
 
     def ring(name: str) -> Array:
         rho, z = ends[name]
@@ -132,7 +140,7 @@ def ring_openings(
 
 
 def meridian_openings(
-    meridian: Meridian, conditions: Mapping[str, Condition], on: Collection[str] = ()
+    meridian: Meridian, conditions: Mapping[str, Condition], on: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
     """The ends that are not held, and those of them where a live pressure has no potential."""
     places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}

@@ -58,8 +58,6 @@ class PressureSection(PathStep):
         loads = [other.load for other in context.steps]
         if any(isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads):
             raise ValueError(f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells")
-        if any(load.kind == "edge" for load in loads):  # type: ignore[attr-defined]
-            raise ValueError(f"{step.key}.on: beside edges that move it is not built: leave out on, or the motion")
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         sides = {"outside": 1.0, "inside": -1.0}
@@ -75,7 +73,7 @@ class PressureSection(PathStep):
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
-        return PressureSection(kind="pressure", control=self.control, hold=self.hold) if last else self
+        return PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on) if last else self
 
     @classmethod
     def implied(cls) -> dict[str, Any]:

@@ -58,8 +58,8 @@ def branch_error(chosen: Adapted, record: Record) -> float:
 def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
     """The branch on the coarsest mesh where it has a result; None without a branch."""
     lost = NoResult("no mesh is fine enough")
-    if first.asked.body or first.asked.given:
-        raise NoResult("of a solid, or of several shells, nothing is carried between meshes")
+    if first.asked.body:
+        raise NoResult("of a solid nothing is carried between meshes")
     for refinement in FIRST:
         scene, choice = first.choice.scene(first.asked, comm), Choice(CHEAP, refinement)
         scene.meshed = choice.applied

@@ -20,7 +20,8 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import leaves_path
-from magshell_fenicsx.simulate.transfer import chart
+from magshell_fenicsx.simulate.touch import of_its_own, with_cuts_here
+from magshell_fenicsx.simulate.transfer import cells_of_shells, chart, nodes_of_shells
 
 Array = NDArray[np.float64]
 CANDIDATES = 12  # number of nearest cells that are searched for a point
@@ -30,6 +31,7 @@ INSIDE = 1e-6  # distance from a cell, in cells, below which a point is inside: 
 BESIDE = 0.1  # largest distance, in cells; two meshes approximate a curved edge differently
 FAR = 1.0  # distance, in cells, beyond which a cell's map is not inverted
 FIELDS = ("lambda_m", "angle")  # amplitudes whose value is prescribed
+MOST_CHANGED = 10  # times that an end gets stiffer penalties or new cuts of shells that touch
 
 
 class NotCarried(RuntimeError):
@@ -42,16 +44,29 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
     Raises
     ------
     NotCarried
-        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of `source`.
+        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its shell in `source`,
+        or one of several shells has no chart.
     """
-    fields, comm, x = CellFields.of(source), target.comm, chart(target)
-    cells, xi, beside = fields.places(x)
-    worst, place = max(
-        comm.allgather((float(beside.max(initial=0.0)), x[np.argmax(beside)].tolist() if len(x) else []))
-    )
-    if worst > BESIDE:
-        raise NotCarried(f"the place {place} of the chart is {worst:.2g} cells beside the other mesh")
-    return target.model.system.held(fields.at(gathered(source, u), cells, xi).ravel())
+    fields, comm, x, values = CellFields.of(source), target.comm, _chart(target), gathered(source, u)
+    if x.shape[1] > target.model.V.mesh.topology.dim:
+        raise NotCarried("a mesh file has no chart")
+    moved, worst = np.zeros((len(x), values.shape[2])), (0.0, list[float]())
+    here = source.model.V.mesh.topology.index_map(source.model.V.mesh.topology.dim).size_local
+    for cells_here, own in zip(cells_of_shells(source), nodes_of_shells(target), strict=True):
+        inside = np.concatenate(source.model.system.comm.allgather(cells_here[:here]))
+        cells, xi, beside = fields.some(inside).places(x[own])
+        moved[own] = fields.at(values, np.flatnonzero(inside)[cells], xi)
+        if own.any():
+            worst = max(worst, (float(beside.max()), x[own][np.argmax(beside)].tolist()))
+    away, place = max(comm.allgather(worst))
+    if away > BESIDE:
+        raise NotCarried(f"the place {place} of the chart is {away:.2g} cells beside the other mesh")
+    return target.model.system.held(moved.ravel())
+
+
+def _chart(scene: Scene) -> Array:
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, of several shells in that of each."""
+    return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 
 def gathered(scene: Scene, u: Vector) -> Array:
@@ -80,12 +95,16 @@ class CellFields:
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
-            own_nodes = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
+            own_nodes = model.midsurface.charted_by_shell(V)[: V.mesh.topology.index_map(2).size_local]
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             x = chart(scene)
             nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[..., : x.shape[1]]
         return cls(nodes, scene.model.V.element.basix_element)
+
+    def some(self, cells: NDArray[np.bool_]) -> "CellFields":
+        """Some of the cells alone."""
+        return self if cells.all() else CellFields(self.nodes[cells], self._element)
 
     @property
     def centres(self) -> Array:
@@ -307,9 +326,14 @@ def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
         u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
     except NotCarried:
         return None
-    guess = State(u, dict(near.state.mu))
-    is_fold = near.kind == "fold"
-    return _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
+    guess = with_cuts_here(scene, State(u, dict(near.state.mu)))
+    for _ in range(MOST_CHANGED):
+        is_fold = near.kind == "fold"
+        end = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
+        if end is None or (own := of_its_own(scene, end.state)) is None:
+            return end
+        guess, tangent = own, end.tangent
+    return None
 
 
 def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:

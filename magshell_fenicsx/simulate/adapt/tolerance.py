@@ -269,8 +269,6 @@ def _first(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
 
 def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
     scene = choice.scene(problem, near[0].comm)
-    if problem.given:  # several shells, which have no chart in common: nothing is carried between their meshes
-        return scene, by_path(scene)
     return scene, from_near(scene, *near)
 
 
