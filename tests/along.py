@@ -100,9 +100,12 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -
 
 
 def check_derivatives(
-    scene: Scene, flat: NDArray[np.float64], deep: tuple[float, float], h: float, seed: int = 0
+    scene: Scene, flat: NDArray[np.float64], deep: tuple[float, float], h: float, seed: int = 0, far: float = 100.0
 ) -> None:
-    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds."""
+    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds.
+
+    `far` is the step of the energy's difference over that of the forces'.
+    """
     system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
     rough, moved, other = (
         system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
@@ -114,6 +117,6 @@ def check_derivatives(
     Kv = times([(1.0, entries)], v)
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
-    energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
-    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-6)
+    energies = [system.energies(u + side * far * v, mu)[term.name] for side in (-0.5, 0.5)]
+    assert energies[1] - energies[0] == pytest.approx(far * system.forces(u, mu, term.name) @ v, rel=1e-6)
     assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)

@@ -324,14 +324,15 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
     if span.vertices is not None:
         return span.vertices
     if span.pieces:
-        touching = {name for pair in problem.loads.pairs for name in pair.names}
-        pressed = {piece.name: [(inf, piece.length)] if piece.name in touching else [] for piece in span.pieces}
+        meets = {piece.name: any(pair.has(piece.name) for pair in problem.loads.pairs) for piece in span.pieces}
+        pressed = {piece.name: [(inf, piece.length)] if meets[piece.name] else [] for piece in span.pieces}
         each = [piece.vertices([*problem.pressed, *pressed[piece.name]]) for piece in span.pieces]
         ends = [float(s[-1]) for s in each[:-1]]
         return np.concatenate([s[s > end] for s, end in zip(each, [-inf, *ends], strict=True)])  # joined ones meet
     pole = span.names[0] is None
     h = problem.material.h / span.curvature
     reach = max((one[1] for one in problem.pressed), default=0.0)
+    reach = span.length if problem.loads.pairs else reach  # folds meet anywhere
     return graded_vertices(
         span.length,
         span.circles,

@@ -229,9 +229,11 @@ class MeridianModel(Thin):
             from magshell_fenicsx.parts.touching.on_meridian import touchings
 
             curves = self.r0, self.u, meridian.patches, self.material.h, rule
-            self.touchings = touchings(loads.pairs, *curves, self.thickness)
+            faces = self.thickness, factory.law_of_cells.thins, factory.natural
+            self.touchings = touchings(loads.pairs, *curves, *faces)
         for each in self.touchings:
             stiffnesses |= each.history
+            parameters |= each.entered(parameters)
         self.tees: list[MeridianTee] = []
         if any(of is None for of in meridian.joints):
             from magshell_fenicsx.shells.tee import tees_of_meridian

@@ -11,6 +11,7 @@ and by r0 that by u, with what the weights and the undeformed areas in V and A a
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dolfinx import fem
@@ -18,9 +19,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter
-from magshell_fenicsx.parts.touching.faces import Faces, on_nodes, slope_of
-from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
+from magshell_fenicsx.parts.touching.faces import Faces, Meshed, on_nodes, slope_of
+from magshell_fenicsx.parts.touching.nearest import Joined, Longs, Places
 from magshell_fenicsx.parts.touching.segments import Points
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.touching.curves import Faced, Rule
 
 Array = NDArray[np.float64]
 Penalty = tuple[Array, Array, Array]
@@ -69,18 +73,18 @@ class Present:
         Of places: distances, normals, and beta with its nodes, see `touching`.
     """
 
-    cells: Cells
+    cells: Meshed
     r0: Array
     u: Array
     faces: Faces | None
-    points: Points
-    places: Places
+    points: "Points | Rule"
+    places: "Places | Faced"
     joined: Joined
     pressed: Penalty
     forces: Array
     find_by_parts: Callable[[], Entries]
     find_entries: Callable[[], Entries]
-    geometry: Callable[[Places], tuple[Array, Array, Array, Longs]]
+    geometry: Callable[[Any], tuple[Array, Array, Array, Longs]]
 
     @cached_property
     def of_faces(self) -> Faces:
@@ -91,9 +95,10 @@ class Present:
     def changed(self, along: Array) -> Array:
         """What the forces change by along changes (nodes, 4) of places and H."""
         rows, columns, values = self.find_by_parts()
-        count, flat = 3 * len(self.r0), np.concatenate([along[:, :3].ravel(), along[:, 3]])
+        flat = np.concatenate([along[:, :-1].ravel(), along[:, -1]])
         product = np.bincount(rows, values * flat[columns], len(flat))
-        return np.column_stack([product[:count].reshape(-1, 3), product[count:]])
+        count = self.r0.size
+        return np.column_stack([product[:count].reshape(self.r0.shape), product[count:]])
 
     def moved(self, w: Array) -> Array:
         """What places and H change by along w (nodes, 3)."""
@@ -102,6 +107,19 @@ class Present:
     def on_nodes(self, forces: Array) -> Array:
         """See `faces.on_nodes`."""
         return on_nodes(self.faces, self.u, forces)
+
+    def of_weights(self, tables: Array, places: Array) -> Array:
+        """The derivatives (n, functions, 3) of weights by nodes, relative.
+
+        Parameters
+        ----------
+        tables, places
+            Shape functions at points with their derivatives (3, n, functions), and so the places (3, n, 3).
+        """
+        n = np.cross(*places[1:])
+        n = n / np.sum(n * n, axis=1)[:, None]
+        one, two = (np.cross(a, b)[:, None] for a, b in ((places[2], n), (n, places[1])))
+        return np.asarray(tables[1][..., None] * one + tables[2][..., None] * two)
 
     def deeper(self, w: Array) -> Array:
         """What penetrations of joined places change by along w (nodes, 3)."""
@@ -123,14 +141,14 @@ class ByGrowth:
     def energy(self) -> float:
         """On this rank's part."""
         now = self.of()
-        forces, growth = now.forces[:, 3], now.of_faces.by_growth(now.u, self.order)
-        of_forces = float(_grown(now)[:, 3] @ now.of_faces.by_growth(now.u)) if self.order == 2 else 0.0
+        forces, growth = now.forces[:, -1], now.of_faces.by_growth(now.u, self.order)
+        of_forces = float(_grown(now)[:, -1] @ now.of_faces.by_growth(now.u)) if self.order == 2 else 0.0
         return of_forces + float(forces @ growth)
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times the gradient of the first one; collective."""
         now = self.of()
-        forces = now.on_nodes(_grown(now)) + now.of_faces.slope_by_growth(now.u, now.forces[:, 3])
+        forces = now.on_nodes(_grown(now)) + now.of_faces.slope_by_growth(now.u, now.forces[:, -1])
         self.add(b, factor * forces)
 
 
@@ -146,7 +164,7 @@ def with_growth(grows: Parameter, of: Callable[[], Present], add: Callable[[Arra
 def _grown(now: Present) -> Array:
     """What the forces (nodes, 4) change by as the faces grow and nothing moves."""
     growth = now.of_faces.by_growth(now.u)
-    return now.changed(np.column_stack([np.zeros((len(growth), 3)), growth]))
+    return now.changed(np.column_stack([0 * now.u, growth]))
 
 
 @dataclass(frozen=True)
@@ -166,7 +184,7 @@ def by_factor(now: Present, of: Weights) -> Array:
 def by_place(now: Present, of: Weights) -> Array:
     """Its derivatives (nodes, 3) by the undeformed place."""
     rows, columns, values = now.find_entries()
-    stiff = np.bincount(rows, values * of.w.ravel()[columns], now.r0.size).reshape(-1, 3)
+    stiff = np.bincount(rows, values * of.w.ravel()[columns], now.r0.size).reshape(now.r0.shape)
     forces = of.energy * now.on_nodes(now.forces) + of.force * stiff + _by_weights(now, of)
     return forces + now.faces.by_area(*_by_volumes(now, of)) if now.faces else forces
 
@@ -174,9 +192,9 @@ def by_place(now: Present, of: Weights) -> Array:
 def _by_volumes(now: Present, of: Weights) -> tuple[Array, Array]:
     """Its derivatives (nodes,) by the volumes V, and by the areas A, from which H follows."""
     H_w = now.of_faces.change(now.u, of.w)
-    g = of.energy * now.forces[:, 3] + of.force * now.changed(np.column_stack([of.w, H_w]))[:, 3]
+    g = of.energy * now.forces[:, -1] + of.force * now.changed(np.column_stack([of.w, H_w]))[:, -1]
     volume, area = now.of_faces.ratio(now.u)
-    slid = of.force * now.forces[:, 3] * H_w
+    slid = of.force * now.forces[:, -1] * H_w
     return g / area + slid / volume, -(g * volume / area + 2 * slid) / area
 
 
@@ -190,11 +208,7 @@ def _by_weights(now: Present, of: Weights) -> Array:
     per_weight = np.bincount(point, (of.energy * value + of.force * first * now.deeper(of.w)) / 2, len(points.cell))
     some = np.unique(point)
     element, nodes = now.cells.element, now.cells.nodes[points.cell[some]]
-    tables = element.tabulate(1, points.shape[some] @ element.points)[1:, ..., 0]
-    a1, a2 = np.einsum("dnk,nki->dni", tables, now.r0[nodes])
-    n = np.cross(a1, a2)
-    J = np.linalg.norm(n, axis=1)
-    n = n / J[:, None]
-    slope = tables[0][..., None] * np.cross(a2, n)[:, None] + tables[1][..., None] * np.cross(n, a1)[:, None]
-    np.add.at(forces, nodes, (per_weight[some] * points.weight[some] / J)[:, None, None] * slope)
+    tables = element.tabulate(1, points.shape[some] @ element.points)[..., 0]
+    slope = now.of_weights(tables, np.einsum("dnk,nki->dni", tables, now.r0[nodes]))
+    np.add.at(forces, nodes, (per_weight[some] * points.weight[some])[:, None, None] * slope)
     return forces

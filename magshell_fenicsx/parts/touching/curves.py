@@ -7,11 +7,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.touching.facing import ALIKE
-from magshell_fenicsx.parts.touching.nearest import BETWEEN_PLACES, BULGE
+from magshell_fenicsx.parts.touching.facing import ALIKE, SHRUNK
+from magshell_fenicsx.parts.touching.nearest import BESIDE, BETWEEN_PLACES, BULGE, near_along_sides
 from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 
 Array = NDArray[np.float64]
@@ -22,6 +21,7 @@ FLAT = 1e-3  # of the square of the speed: below it the step takes that
 START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
 SAME = 1e-9  # of h: places of two cells at the same distance are one
 SIGNS = np.array([1.0, 1.0, -1.0])  # of the squares of components in A
+BELOW = 0.5  # the sine of an angle between a curve and the way from a place to a point that is above it
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,49 @@ def beside(nodes: Longs) -> Longs:
     return beyond
 
 
+class Around:
+    """The material around a point, which it does not touch, see `nearest`.
+
+    Parameters
+    ----------
+    points, cells
+        Undeformed places of the points (n, 3) and of the nodes of all cells (cells, functions, 3), the last component
+        half the thickness, of points with the other sign.
+    nodes
+        (cells, functions) of all cells, the ends first.
+    of
+        (n,) cells of the points.
+    """
+
+    def __init__(self, points: Array, cells: Array, nodes: Longs, of: Longs) -> None:
+        self._points, self._cells, self.of, count = points, cells, of, len(nodes)
+        r0 = np.zeros((int(nodes.max()) + 1, 3))
+        r0[nodes] = cells
+        near: Inside = np.zeros(count * count, dtype=bool)
+        near[near_along_sides(nodes[:, :2], r0[:, :2], 2 * BESIDE * r0[:, 2])] = True
+        self._near = near.reshape(count, count)
+
+    def near(self, cell: Longs, other: Longs) -> Inside:
+        """Whether the way from cells (n,) to others, -1 for none, is short along the curve."""
+        return np.asarray(self._near[cell, other] & (other >= 0))
+
+    def fits(self, cell: Longs, other: Longs, nodal: Array) -> Inside:
+        """Whether cells (n,) may touch others: of those near along the curve where one is folded."""
+        fits = ~self._near[cell, other]
+        near = np.flatnonzero(~fits & (cell != other))
+        i, j = cell[near], other[near]
+        now, way = (np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3) for r in (nodal, self._cells[..., :2]))
+        fits[near] = (now < SHRUNK * way).any(axis=(1, 2))
+        return fits
+
+    def apart(self, at: "Faced", shape: Array, above: Inside) -> Inside:
+        """Which places count: those far along the curve, or else far undeformed and above or below their points."""
+        near = self.near(self.of[at.point], at.cell)
+        off = self._points[at.point] - np.einsum("nk,nki->ni", shape, self._cells[at.cell])
+        away = np.linalg.norm(off[:, :2], axis=1) > BESIDE * np.abs(off[:, 2])
+        return np.asarray(~near | (above & away))
+
+
 class Close:
     """Which cells of the other shell points may be near to: from circles about cells, then from chords.
 
@@ -95,10 +138,15 @@ class Close:
         Whether each cell belongs to the first shell, and to the second.
     element
         Of basix.
+    around
+        Of a shell that may touch itself; both sides are then the same.
     """
 
-    def __init__(self, rule: Rule, nodes: Longs, sides: tuple[Inside, Inside], element: Any) -> None:
+    def __init__(
+        self, rule: Rule, nodes: Longs, sides: tuple[Inside, Inside], element: Any, around: Around | None
+    ) -> None:
         self._one, self._other = (np.flatnonzero(side) for side in sides)
+        self._around = around
         self._counts = np.bincount(rule.cell, minlength=len(nodes))
         self._starts = np.zeros_like(self._counts)  # points of a cell follow each other
         self._starts[rule.cell[::-1]] = np.arange(len(rule.cell))[::-1]
@@ -130,7 +178,12 @@ class Close:
         radii = BULGE * np.sqrt(np.sum((nodal - centres[:, None]) ** 2, axis=2).max(axis=1))
         way = centres[one][:, None] - centres[other]
         i, j = np.nonzero(np.sum(way * way, axis=2) < (radii[one][:, None] + radii[other] + reach) ** 2)
-        of, cell = np.concatenate([one[i], other[j]]), np.concatenate([other[j], one[i]])
+        of, cell = one[i], other[j]
+        if self._around:
+            fits = self._around.fits(of, cell, nodal)
+            of, cell = of[fits], cell[fits]
+        else:
+            of, cell = np.concatenate([of, cell]), np.concatenate([cell, of])
         count = self._counts[of]
         first = np.repeat(self._starts[of] - np.cumsum(count) + count, count)
         return first + np.arange(len(first)), np.repeat(cell, count)
@@ -178,12 +231,15 @@ class Curves:
         (cells, 2): the cell beyond each end; -1 where there is none.
     lebesgue
         See `nearest.highest`.
+    at_nodes
+        (places, functions): derivatives of shape functions at the nodes.
     """
 
     def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
         self.element, self.nodes, self._r0, self._h = element, nodes, r0, h
         self.beside = beside(nodes)
         self._start = np.linspace(0.0, 1.0, START * element.degree + 1, dtype=np.float64)
+        self.at_nodes = self.table(1, element.points.ravel())[1]
         self.lebesgue = BETWEEN_PLACES * float(np.abs(self.table(0, self._start)[0]).sum(axis=1).max())
 
     def table(self, order: int, X: Array) -> Array:
@@ -221,31 +277,38 @@ class Curves:
         shape = self.table(0, self._start)[0]
         off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
         X = self._start[distances(off).argmin(axis=1)]
+        moving = np.arange(len(X))
         for _ in range(ROUNDS):
-            pull, bent, speed = slopes(x[point], self.jets(X, nodal[cell]))
+            pull, bent, speed = slopes(x[point[moving]], self.jets(X[moving], nodal[cell[moving]]))
             step = pull / np.where(bent > FLAT * speed, bent, speed)
-            after = np.clip(X + np.clip(step, -0.25, 0.25), 0.0, 1.0)
-            moved, X = np.abs(after - X).max(initial=0.0), after
-            if moved < EXACT:
+            before = X[moving]
+            X[moving] = np.clip(before + np.clip(step, -0.25, 0.25), 0.0, 1.0)
+            moving = moving[np.abs(X[moving] - before) >= EXACT]
+            if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
         pull, *_ = slopes(x[point], jets)
         free = ~((X == 0.0) & (pull <= 0) | (X == 1.0) & (pull >= 0))
         return Faced(point, cell, X, free, distances(x[point] - jets[0]))
 
-    def nearest(self, at: Faced, x: Array, nodal: Array) -> Faced:
+    def nearest(self, at: Faced, x: Array, nodal: Array, around: Around | None) -> Faced:
         """Of all places those from which the curve goes on to no nearer one, one on each side of a point."""
         number = len(self.nodes)
-        order = np.argsort(at.point * number + at.cell)
-        at = at.of(order)
+        at = at.of(np.argsort(at.point * number + at.cell))
+        above: Inside = np.ones(len(at.point), dtype=bool)
+        if around:
+            above = self._above(at, x, nodal)
+            counts = around.apart(at, self.table(0, at.X)[0], above)
+            at, above = at.of(counts), above[counts]
         keys = at.point * number + at.cell
-        stays = np.ones(len(keys), dtype=bool)
+        stays: Inside = np.ones(len(keys), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
             beyond = self.beside[at.cell, end]
             there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
             listed = keys[there] == at.point * number + beyond
             nearer = listed & (at.distance[there] < at.distance - SAME * self._h)
-            stays &= ~((at.X == X) & (beyond >= 0)) | (listed & ~nearer)
+            folded = above & around.near(around.of[at.point], beyond) if around else False
+            stays &= ~((at.X == X) & (beyond >= 0)) | (listed & ~nearer) | folded
         at = at.of(stays)
         at = at.of(np.lexsort((at.distance, at.point)))
         if not len(at.point):
@@ -261,35 +324,15 @@ class Curves:
         chosen[others[np.flatnonzero(np.diff(at.point[others], prepend=-1))]] = True
         return at.of(chosen)
 
+    def _above(self, at: Faced, x: Array, nodal: Array) -> Inside:
+        """Whether points are above or below their places, and not beside them as in one curve that is straight."""
+        y, along, _ = self.jets(at.X, nodal[at.cell])[..., :2]
+        way = x[at.point, :2] - y
+        high = np.abs(way[:, 0] * along[:, 1] - way[:, 1] * along[:, 0])
+        return np.asarray(high > BELOW * np.linalg.norm(way, axis=1) * np.linalg.norm(along, axis=1))
+
     def cell_normals(self) -> Array:
         """(cells, 2) undeformed, of the straight lines between the ends."""
         a, b = self._r0[self.nodes[:, 0]], self._r0[self.nodes[:, 1]]
         n = np.column_stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]])
         return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
-
-    def at_nodes(self, thickness: fem.Function) -> Array:
-        """What multiplies h at nodes, of cells with a node in common the mean by their lengths."""
-        t = thickness.x.array[thickness.function_space.dofmap.list]
-        return self._sum(self.speeds() * t) / self.lengths
-
-    @property
-    def lengths(self) -> Array:
-        """The sum (nodes,) of the speeds of all cells at a node."""
-        return self._sum(self.speeds())
-
-    def _sum(self, values: Array) -> Array:
-        return np.bincount(self.nodes.ravel(), values.ravel(), len(self._r0)).astype(float)
-
-    def speeds(self) -> Array:
-        """(cells, functions) lengths per that of the reference cell at the nodes, undeformed."""
-        return np.asarray(np.linalg.norm(self._along()[1], axis=2))
-
-    def by_speed(self) -> Array:
-        """The derivatives (cells, functions, functions, 2) of these by the nodes of the cell."""
-        table, along = self._along()
-        unit = along / np.linalg.norm(along, axis=2)[..., None]
-        return np.asarray(table[None, :, :, None] * unit[:, :, None])
-
-    def _along(self) -> tuple[Array, Array]:
-        table = self.table(1, self.element.points.ravel())[1]
-        return table, np.einsum("qk,cki->cqi", table, self._r0[self.nodes])

@@ -10,7 +10,8 @@ exact.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 import scipy
@@ -48,6 +49,15 @@ class _Tilted:
         return np.asarray(np.einsum("cqmi,cqi->cqm", self.by_node, self.normal))
 
 
+class Meshed(Protocol):
+    """Cells with an element of basix, and (cells, functions) the numbers of their nodes."""
+
+    @property
+    def element(self) -> Any: ...
+    @property
+    def nodes(self) -> Longs: ...
+
+
 class Faces:
     """Half the thickness at all nodes.
 
@@ -75,7 +85,7 @@ class Faces:
 
     def __init__(
         self,
-        cells: Cells,
+        cells: Meshed,
         r0: Array,
         h: float,
         thickness: Array,
@@ -85,7 +95,7 @@ class Faces:
     ) -> None:
         self._cells, self._r0, self._thins, self._thin = cells, r0, thins, np.flatnonzero(thins)
         self._same, self.grown, self._places = same, grown, same[cells.nodes]
-        self._table = cells.element.tabulate(1, cells.element.points)[1:, :, :, 0]
+        self._parts = r0.shape[1]  # of a displacement
         J0 = self._areas(r0, slice(None))
         self._volumes = h / 2 * np.array([self._sum(slice(None), each * J0) for each in thickness])
         self._thickness = thickness[0]
@@ -115,7 +125,7 @@ class Faces:
         """The derivative (nodes, 3) of sum f H, with f (nodes,)."""
         if self.constant:
             return np.zeros_like(u)
-        return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(-1, 3))
+        return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(len(u), -1))
 
     def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
@@ -144,31 +154,23 @@ class Faces:
         h_t = np.polynomial.polynomial.polyval(self.value, self._per_factor) * self._thickness
         by_J0 = of_volume * h_t + of_area * ~self._thins[:, None]
         some = np.flatnonzero((by_J0 != 0).any(axis=1))
-        slope = self._tilted(0 * self._r0, some).slope
         forces = np.zeros(self._r0.size)
-        np.add.at(forces, unknowns(self._cells.nodes[some], len(self._r0)), np.einsum("cq,cqm->cm", by_J0[some], slope))
-        return forces.reshape(-1, 3)
+        by_place = np.einsum("cq,cqm->cm", by_J0[some], self._area_slopes(0 * self._r0, some))
+        np.add.at(forces, self._unknowns(some), by_place)
+        return forces.reshape(self._r0.shape)
 
     def slope_by_growth(self, u: Array, f: Array) -> Array:
         """The derivative (nodes, 3) of sum f dH, with dH by the amplitude."""
         weight = -f * self._volume(1) / self._area(u) ** 2
-        return np.asarray((self._slopes(u, f != 0).T @ weight).reshape(-1, 3))
+        return np.asarray((self._slopes(u, f != 0).T @ weight).reshape(len(u), -1))
 
     def hessian(self, u: Array, f: Array) -> Any:
         """The sparse second derivative (3 nodes, 3 nodes) of sum f H."""
         some, area, by = self._around(f != 0), self._area(u), self._slopes(u, f != 0)
         weight = -f * self._volume() / area**2
         whole = by.T @ scipy.sparse.diags_array(-2 * weight / area) @ by
-        at, nodes = self._tilted(u, some), self._cells.nodes[some]
-        T, slope, w = at.by_node, at.slope, np.bincount(self._same, weight, len(weight))[self._places[some]]
-        H = np.einsum("cqmi,cqni->cmn", T * (w / at.J)[..., None, None], T)
-        H -= np.einsum("cqm,cqn->cmn", slope * (w / at.J)[..., None], slope)
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            twist = np.einsum("cq,qm,qn->cmn", w * at.normal[..., k], *self._table)
-            twist -= np.swapaxes(twist, 1, 2)
-            H[:, i::3, j::3] += twist
-            H[:, j::3, i::3] -= twist
-        dofs = unknowns(nodes, len(self._r0))
+        H = self._bends(u, some, np.bincount(self._same, weight, len(weight)).astype(float)[self._places[some]])
+        dofs = self._unknowns(some)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
         return whole + scipy.sparse.coo_array((H.ravel(), (rows.ravel(), columns.ravel())), whole.shape).tocsr()
 
@@ -181,7 +183,8 @@ class Faces:
             (nodes,) the first derivative by H.
         """
         rows, columns, values = entries
-        size, count = 4 * len(f), 3 * len(f)
+        count = self._parts * len(f)
+        size = count + len(f)
         if self.constant:  # H stays
             of_places = (rows < count) & (columns < count)
             return rows[of_places], columns[of_places], values[of_places]
@@ -214,10 +217,6 @@ class Faces:
     def _area(self, u: Array) -> Array:
         return self._stays + self._sum(self._thin, self._areas(self._r0 + u, self._thin))
 
-    def _areas(self, r: Array, some: Any) -> Array:
-        a1, a2 = np.einsum("dqk,cki->dcqi", self._table, r[self._cells.nodes[some]])
-        return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
-
     def _sum(self, some: Any, values: Array) -> Array:
         """At nodes, of values (cells, functions) in some cells."""
         of_places = np.bincount(self._places[some].ravel(), values.ravel(), len(self._r0))
@@ -231,11 +230,42 @@ class Faces:
     def _slopes(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """Derivatives (nodes, 3 nodes) of the areas at some nodes."""
         some = self._around(which)
-        nodes, slope = self._cells.nodes[some], self._tilted(u, some).slope
-        places = self._places[some]
-        rows, columns = np.broadcast_arrays(places[:, :, None], unknowns(nodes, len(self._r0))[:, None, :])
-        size = len(self._r0), self._r0.size
+        slope, places = self._area_slopes(u, some), self._places[some]
+        rows, columns = np.broadcast_arrays(places[:, :, None], self._unknowns(some)[:, None, :])
+        size = len(self._r0), self._parts * len(self._r0)
         return scipy.sparse.coo_array((slope.ravel(), (rows.ravel(), columns.ravel())), size).tocsr()[self._same]
+
+    def _unknowns(self, some: Longs) -> Longs:
+        """Numbers of those of the displacement in some cells."""
+        return unknowns(self._cells.nodes[some], len(self._r0), self._parts, self._parts)
+
+    # of surfaces
+
+    @cached_property
+    def _table(self) -> Array:
+        """The derivatives (2, places, functions) of shape functions at the nodes."""
+        return np.asarray(self._cells.element.tabulate(1, self._cells.element.points)[1:, :, :, 0])
+
+    def _areas(self, r: Array, some: Any) -> Array:
+        a1, a2 = np.einsum("dqk,cki->dcqi", self._table, r[self._cells.nodes[some]])
+        return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
+
+    def _area_slopes(self, u: Array, some: Longs) -> Array:
+        """The derivatives (cells, places, dofs) of areas by what moves the nodes of their cells."""
+        return self._tilted(u, some).slope
+
+    def _bends(self, u: Array, some: Longs, w: Array) -> Array:
+        """The second derivatives (cells, dofs, dofs) of areas times w (cells, places)."""
+        at = self._tilted(u, some)
+        T, slope = at.by_node, at.slope
+        H = np.einsum("cqmi,cqni->cmn", T * (w / at.J)[..., None, None], T)
+        H -= np.einsum("cqm,cqn->cmn", slope * (w / at.J)[..., None], slope)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            twist = np.einsum("cq,qm,qn->cmn", w * at.normal[..., k], *self._table)
+            twist -= np.swapaxes(twist, 1, 2)
+            H[:, i::3, j::3] += twist
+            H[:, j::3, i::3] -= twist
+        return np.asarray(H)
 
     def _tilted(self, u: Array, some: Longs) -> _Tilted:
         a1, a2 = np.einsum("dqk,cki->dcqi", self._table, (self._r0 + u)[self._cells.nodes[some]])
@@ -247,10 +277,11 @@ class Faces:
         return _Tilted(J, n / J[..., None], turned.reshape(*J.shape, 3 * J.shape[1], 3))
 
 
-def unknowns(nodes: Longs, count: int, parts: int = 3) -> Longs:
-    """Numbers (n, parts functions) of the unknowns at nodes (n, functions) of `count`: those of H, the fourth of parts,
-    after all of the displacement."""
-    dofs = np.concatenate([3 * nodes[:, :, None] + np.arange(3), 3 * count + nodes[:, :, None]], axis=2)[..., :parts]
+def unknowns(nodes: Longs, count: int, parts: int = 3, dim: int = 3) -> Longs:
+    """Numbers (n, parts functions) of the unknowns at nodes (n, functions) of `count`: those of H, the last of parts
+    where these are more than `dim`, after all of the displacement."""
+    of_place = dim * nodes[:, :, None] + np.arange(dim)
+    dofs = np.concatenate([of_place, dim * count + nodes[:, :, None]], axis=2)[..., :parts]
     return np.asarray(dofs.reshape(len(nodes), parts * nodes.shape[1]))
 
 
@@ -305,8 +336,8 @@ def hessians(
 
 
 def on_nodes(faces: Faces | None, u: Array, forces: Array) -> Array:
-    """The forces (nodes, 3) by the displacement, of those by place and thickness, at the displacement u (nodes, 3)."""
-    return np.asarray(forces[:, :3] + (faces.slope(u, forces[:, 3]) if faces else 0.0))
+    """The forces by the displacement u (nodes, 3), of those by place and thickness."""
+    return np.asarray(forces[:, :-1] + faces.slope(u, forces[:, -1])) if faces else forces
 
 
 def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int) -> Entries:

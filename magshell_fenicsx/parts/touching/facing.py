@@ -163,16 +163,12 @@ class Facing:
         """
         if self._faces and not self._faces.constant:
             return np.inf
-        cell_of = np.zeros(len(self._r0), dtype=np.int64)
-        cell_of[self._cells.nodes.ravel()] = np.repeat(np.arange(len(self._cells.nodes)), self._cells.nodes.shape[1])
-        cells, before, half = cell_of[held], self._r0[held], self.half[held]
-        thickness = half[:, None] + half
-        i, j = np.nonzero(scipy.spatial.distance.cdist(before, before) > (1 - SAME) * thickness)
-        near = np.linalg.norm(before[i] + u[held[i]] - before[j] - u[held[j]], axis=1) - thickness[i, j]
-        counts = near < 0
-        i, j, near = i[counts], j[counts], near[counts]
-        apart = self._allowed(cells[i], cells[j]) & ~self._is_beside(cells[i] * len(self._cells.nodes) + cells[j])
-        return float(near[apart].min(initial=np.inf))
+        count = len(self._cells.nodes)
+
+        def may(i: Longs, j: Longs) -> Inside:
+            return np.asarray(self._allowed(i, j) & ~self._is_beside(i * count + j))
+
+        return between_held(held, self._cells.nodes, self._r0, u, self.half, may)
 
     def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement, within a distance of
@@ -273,6 +269,28 @@ class Facing:
         on_edge |= in_corner & (~on_side & self._cells.on_edge[nearest.cell]).any(axis=1)
         level = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
         return np.asarray(on_edge), np.asarray(level < STEEP)
+
+
+def between_held(
+    held: Longs, nodes: Longs, r0: Array, u: Array, half: Array, may: Callable[[Longs, Longs], Inside]
+) -> float:
+    """The least gap between faces at some nodes at a displacement, see `Facing.held_gap`.
+
+    Parameters
+    ----------
+    nodes
+        (cells, functions) of all cells.
+    may
+        Whether cells (n,) may touch others and are not near them in the surface.
+    """
+    cell_of = np.zeros(len(r0), dtype=np.int64)
+    cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    cells, before, after, thickness = cell_of[held], r0[held], (r0 + u)[held], half[held][:, None] + half[held]
+    i, j = np.nonzero(scipy.spatial.distance.cdist(before, before) > (1 - SAME) * thickness)
+    near = np.linalg.norm(after[i] - after[j], axis=1) - thickness[i, j]
+    counts = near < 0
+    i, j, near = i[counts], j[counts], near[counts]
+    return float(near[may(cells[i], cells[j])].min(initial=np.inf))
 
 
 def nowhere() -> Places:

@@ -6,7 +6,7 @@ give the point's force the work that its energy changes by, and its derivative t
 straight motion these are the mean pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Generic, Protocol, TypeVar
@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import ROUNDING, penalty
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, with_growth
+from magshell_fenicsx.parts.touching.faces import Faces, on_nodes
 from magshell_fenicsx.parts.touching.section import Pair
 
 Array = NDArray[np.float64]
@@ -184,8 +187,10 @@ class ContactTerm:
     amplitude = None
     column = ""
 
-    def __init__(self, pair: Pair) -> None:
+    def __init__(self, pair: Pair, shape: Shape, faces: Faces | None) -> None:
         self.pair, self.name = pair, f"contact{pair.suffix}"
+        self._shape, self._faces = shape, faces
+        self._at: Array = np.zeros((0, 0))  # the displacement of the places
         self.group = self.name
         self.stiffness = Number(pair.stiffness)
         self.looks: Sequence[Look] = ()  # see `InSteps`
@@ -208,6 +213,10 @@ class ContactTerm:
         """See `FiniteElementSystem`."""
         return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
 
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor dPi/du; collective."""
+        self._add(b, factor * np.sum(of_each(self, lambda: self._on_nodes(self._forces())), axis=0))  # type: ignore[arg-type]
+
     def compile_residual(self) -> None:
         """It has no forms."""
 
@@ -221,5 +230,24 @@ class ContactTerm:
         rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)  # type: ignore[arg-type]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
+    def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+        """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
+        grown = self._faces.grown if self._faces else None
+        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
+
+    def _on_nodes(self, forces: Array) -> Array:
+        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
+
+    def _forces(self) -> Array:
+        """The derivative (nodes, dim) of this rank's energy by the places of all nodes, or by H too."""
+        raise NotImplementedError
+
     def _entries(self) -> Entries:
+        raise NotImplementedError
+
+    def _present(self) -> Present:
+        raise NotImplementedError
+
+    def _add(self, b: Array, forces: Array) -> None:
+        """Add forces (nodes, 2 or 3) of this rank's points; collective."""
         raise NotImplementedError

@@ -123,38 +123,46 @@ class Cells:
         return np.linalg.inv([x ** (n - j) * y**j for n in range(self.element.degree + 1) for j in range(n + 1)]).T
 
     def near_in_surface(self, r0: Array, far: Array) -> Longs:
-        """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than the mean of
-        `far` at its ends.
-
-        Parameters
-        ----------
-        r0, far
-            (nodes, 3) undeformed, and (nodes,).
-        """
-        count, n = int(self.corners.max()) + 1, len(self.corners)
-        x, reach = np.zeros((count, 3)), np.zeros(count)
+        """See `near_along_sides`; both are of all nodes."""
+        x, reach = np.zeros((int(self.corners.max()) + 1, 3)), np.zeros(int(self.corners.max()) + 1)
         x[self.corners], reach[self.corners] = self.at_corners @ r0[self.nodes], far[self.nodes] @ self.at_corners.T
-        farthest = float(reach.max())
-        a, b = (np.concatenate([self.corners[:, c] for c in of]) for of in ((0, 1, 2), (1, 2, 0)))
-        ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
-        ways = ways.tocoo()
-        lengths = np.linalg.norm(x[ways.row] - x[ways.col], axis=1)
-        graph = scipy.sparse.coo_array((lengths, (ways.row, ways.col)), (count, count)).tocsr()
-        axis = int(np.ptp(x, axis=0).argmax())
-        order = np.argsort(x[:, axis], kind="stable")
-        near = list[tuple[Longs, Longs]]()
-        for some in np.array_split(order, max(1, count // STRIP)):  # a way that short leaves a strip by no more
-            low, high = x[some[0], axis] - farthest, x[some[-1], axis] + farthest
-            around = order[np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")]
-            inside = np.flatnonzero(np.isin(around, some))
-            reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=farthest)
-            row, column = np.nonzero(reached <= (reach[around[inside], None] + reach[around]) / 2)
-            near.append((around[inside[row]], around[column]))
-        i, j = (np.concatenate(each) for each in zip(*near, strict=True))
-        between = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()
-        has = scipy.sparse.coo_array((np.ones(3 * n), (np.repeat(np.arange(n), 3), self.corners.ravel())), (n, count))
-        i, j = (has.tocsr() @ between @ has.tocsr().T).nonzero()
-        return np.asarray(np.unique(i.astype(np.int64) * n + j))
+        return near_along_sides(self.corners, x, reach)
+
+
+def near_along_sides(corners: Longs, x: Array, reach: Array) -> Longs:
+    """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than the mean of the
+    reach at its ends.
+
+    Parameters
+    ----------
+    corners
+        (cells, 3), or (cells, 2) of a curve.
+    x, reach
+        (vertices, dim) undeformed, and (vertices,).
+    """
+    count, (n, per_cell) = len(x), corners.shape
+    farthest = float(reach.max())
+    a, b = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
+    ways = ways.tocoo()
+    lengths = np.linalg.norm(x[ways.row] - x[ways.col], axis=1)
+    graph = scipy.sparse.coo_array((lengths, (ways.row, ways.col)), (count, count)).tocsr()
+    axis = int(np.ptp(x, axis=0).argmax())
+    order = np.argsort(x[:, axis], kind="stable")
+    near = list[tuple[Longs, Longs]]()
+    for some in np.array_split(order, max(1, count // STRIP)):  # a way that short leaves a strip by no more
+        low, high = x[some[0], axis] - farthest, x[some[-1], axis] + farthest
+        around = order[np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")]
+        inside = np.flatnonzero(np.isin(around, some))
+        reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=farthest)
+        row, column = np.nonzero(reached <= (reach[around[inside], None] + reach[around]) / 2)
+        near.append((around[inside[row]], around[column]))
+    i, j = (np.concatenate(each) for each in zip(*near, strict=True))
+    between = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()
+    of_cell = np.repeat(np.arange(n), per_cell)
+    has = scipy.sparse.coo_array((np.ones(len(of_cell)), (of_cell, corners.ravel())), (n, count))
+    i, j = (has.tocsr() @ between @ has.tocsr().T).nonzero()
+    return np.asarray(np.unique(i.astype(np.int64) * n + j))
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,16 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.parts.gap import SOFT, expanded, penalty
+from magshell_fenicsx.parts.gap import SOFT, Grown, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
-from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Close, Curves, Faced, distances, nowhere, slopes
-from magshell_fenicsx.parts.touching.facing import STEEP
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
+from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Around, Close, Curves, Faced, distances, nowhere, slopes
+from magshell_fenicsx.parts.touching.faces import slope_of, unknowns
+from magshell_fenicsx.parts.touching.facing import STEEP, between_held
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
-from magshell_fenicsx.parts.touching.nearest import FOLLOWING, highest
-from magshell_fenicsx.parts.touching.section import Pair
+from magshell_fenicsx.parts.touching.nearest import FOLLOWING, Joined, highest
+from magshell_fenicsx.parts.touching.rings import IN_PLANE, Rings
+from magshell_fenicsx.parts.touching.section import WHOLE, Pair
 from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH
 
 Array = NDArray[np.float64]
@@ -45,40 +48,51 @@ class MeridianTouching(ContactTerm):
     ----------
     sides
         Whether each cell belongs to the first shell, and to the second.
+    curves
+        The meridians of all shells.
+    r0
+        (nodes, 2) undeformed.
     h
         Thickness over R: that of the penalty and of the search where it varies.
     degree
         Of the quadrature.
-    thickness
-        What multiplies h, (1,); None for 1.
+    shape
+        The fields that the gap depends on.
+    faces
+        How far they are from the meridian where the thickness varies, or changes with the state; None where it is h.
     """
 
     def __init__(
         self,
         pair: Pair,
-        r0: fem.Function,
+        curves: Curves,
+        r0: Array,
         u: fem.Function,
         sides: tuple[Inside, Inside],
         h: float,
         degree: int,
-        thickness: fem.Function | None = None,
+        shape: Shape,
+        faces: Rings | None = None,
     ) -> None:
-        super().__init__(pair)
-        self._h, self._u, self._placement, self._thickness = h, u, r0, thickness
-        V = r0.function_space
-        self._nodes = V.dofmap.list.astype(np.int64)
-        self._sides, self._r0 = sides, np.array(r0.x.array.reshape(-1, 2))
-        self._curves = Curves(V.element.basix_element, self._nodes, self._r0, h)
-        self._rule = self._curves.rule(degree // 2 + 1, sides)
-        self._normals = self._curves.cell_normals()
-        self._half = h / 2 * (np.ones(len(self._r0)) if thickness is None else self._curves.at_nodes(thickness))
-        of_both = self._half[self._nodes[np.any(sides, axis=0)]]
-        self._thinnest, self._far = 2 * float(of_both.min()), h + (REACH - 1) * 2 * float(of_both.max())
-        self._at: Array = np.full_like(self._r0, np.nan)
+        super().__init__(pair, shape, faces)
+        self._h, self._u, self._rings, self._curves = h, u, faces, curves
+        self._nodes, self._sides, self._r0 = curves.nodes, sides, r0
+        self._rule = curves.rule(degree // 2 + 1, sides)
+        self._normals = curves.cell_normals()
+        self._half = np.full(len(r0), h / 2) if faces is None else faces.undeformed
+        self._touched = np.unique(self._nodes[np.any(sides, axis=0)])
+        self._far = h + (REACH - 1) * 2 * float(self._half[self._touched].max())
+        self._around: Around | None = None
+        if np.any(sides[0] & sides[1]):
+            undeformed = np.column_stack([r0, self._half])
+            nodal = undeformed[self._nodes]
+            self._around = Around(self._x_of(undeformed), nodal, self._nodes, self._rule.cell)
+        self._at = np.full_like(r0, np.nan)
+        self._grown = 0.0
         self._places = nowhere()
         self._looked_at = Kept[tuple[Array, Faced]]()
         self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
-        self._close = Close(self._rule, self._nodes, sides, V.element.basix_element)
+        self._close = Close(self._rule, self._nodes, sides, curves.element, self._around)
 
     # as a term
 
@@ -87,22 +101,33 @@ class MeridianTouching(ContactTerm):
         at = self._pressed()
         return float(self._rule.weight[at.point] @ self._penalty(at)[0]) / 2
 
-    def add_residual(self, b: Array, factor: float) -> None:
-        forces = np.sum(of_each(self, self._forces), axis=0)
-        b[: forces.size] += factor * forces.ravel()
+    def _add(self, b: Array, forces: Array) -> None:
+        b[: forces.size] += forces.ravel()
 
     def _forces(self) -> Array:
+        """The derivative (nodes, 2) by the places of all nodes, or with H (nodes, 3)."""
         at = self._pressed()
         weight = self._rule.weight[at.point] / 2 * self._penalty(at)[1]
         _, n, beta, nodes = self._geometry(at)
-        forces = np.zeros_like(self._r0)
-        np.add.at(forces, nodes, -(weight[:, None] * beta)[..., None] * n[:, None])
+        forces = np.zeros((len(self._r0), 3 if self._faces else 2))
+        np.add.at(forces, nodes, -weight[:, None, None] * slope_of(n, beta, forces.shape[1]))
         return forces
 
+    def _by_parts(self) -> Entries:
+        """Those of the second derivative by place and thickness."""
+        return self._joined(*self._second(0.0), [0, 2])
+
     def _entries(self) -> Entries:
-        H, nodes = self._second(0.0)
-        of_plane = np.flatnonzero(np.arange(H.shape[1]) % 3 != 1)
-        return _entries(H[:, of_plane[:, None], of_plane], nodes, 2)
+        entries = self._by_parts()
+        return self._faces.entries(self._at, entries, self._forces()[:, -1]) if self._faces else entries
+
+    def _joined(self, H: Array, nodes: Longs, of_place: list[int]) -> Entries:
+        """Blocks (n, dofs, dofs) by (U, V, W, H) at nodes (n, functions), of some of these and H, where it varies."""
+        parts = [*of_place, 3] if self._faces else of_place
+        which = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, parts))
+        dofs = unknowns(nodes, len(self._r0), len(parts), len(of_place))
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
+        return rows.ravel(), columns.ravel(), H[:, which[:, None], which].ravel()
 
     @property
     def since(self) -> float:
@@ -111,7 +136,8 @@ class MeridianTouching(ContactTerm):
 
     def around(self) -> tuple[Longs, Longs]:
         """See `Coupled`: the nodes of cells that touch."""
-        return pairs_of(np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1))
+        nodes = np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1)
+        return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
     def _touching_cells(self) -> Longs:
         both = [np.column_stack([self._rule.cell[at.point], at.cell]) for at in of_each(self, self._pressed)]
@@ -119,64 +145,34 @@ class MeridianTouching(ContactTerm):
 
     def entries_of_waves(self, m: float) -> Entries:
         """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
-        H, nodes = self._second(m)
-        H[:, 1::3] -= H[:, ::3]  # with P = U + V, U is P - V
-        H[..., 1::3] -= H[..., ::3]
-        return _entries(H / 2, nodes, 3)
+        rows, columns, values = self._joined(*self._second(m), [0, 1, 2])
+        if self._rings:
+            given = self._at, (rows, columns, values), self._forces()[:, -1]
+            rows, columns, values = self._rings.waves(m).entries(*given)
+        for _ in range(2):  # with P = U + V, U is P - V
+            of_U = columns % 3 == 0
+            values = np.concatenate([values, -values[of_U]])
+            rows, columns = np.concatenate([columns, columns[of_U] + 1]), np.concatenate([rows, rows[of_U]])
+        return rows, columns, values / 2
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
         """Of thickness and placement; see `assembly.coupled.KnowsFields` and `by_fields`."""
-        field = {"thickness": self._thickness, "r0": self._placement}.get(name)
+        field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
         if field is None:
             return None
-        w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
-        by_half = self._by_half(w, energy, force)[self._nodes]
-        speeds, lengths = self._curves.speeds(), self._curves.lengths[self._nodes]
+        weights = Weights(direction.x.array.reshape(-1, 2)[: len(self._r0)], energy, force)
         if name == "thickness":
-            return field, (by_half * self._h / 2 * speeds / lengths)[..., None]
-        rows, columns, values = self._entries()
-        stiff = np.bincount(rows, values * w.ravel()[columns], w.size).reshape(-1, 2)
-        nodal = energy * self._forces() + force * stiff + self._by_weights(w, energy, force)
-        if self._thickness is not None:
-            t = self._thickness.x.array[self._thickness.function_space.dofmap.list]
-            by_speed = by_half * (self._h / 2 * t - self._half[self._nodes]) / lengths
-            np.add.at(nodal, self._nodes, np.einsum("cq,cqki->cki", by_speed, self._curves.by_speed()))
-        count = np.bincount(self._nodes.ravel(), minlength=len(nodal))
-        return field, np.asarray((nodal / count[:, None])[self._nodes])
+            return field, by_factor(self._present(), weights)[..., None]
+        return field, self._shape.shared(by_place(self._present(), weights))
 
-    def _by_half(self, w: Array, energy: float, force: float) -> Array:
-        """By half the thickness at nodes (nodes,), of energy Pi + force w . Pi,u."""
-        at, by_half = self._pressed(), np.zeros(len(self._r0))
-        _, first, second = self._penalty(at)
-        off, n, beta, nodes = self._geometry(at)
-        count, functions = beta.shape
-        half, weight = functions // 2, self._rule.weight[at.point] / 2
-        normal, slide, A = self._rows(at, off, n, beta)
-        along = np.insert(w, 1, 0.0, axis=1)[nodes].reshape(count, -1)
-        farther, slid = (np.sum(row.reshape(count, -1) * along, axis=1) for row in (normal, slide))
-        thicker = np.concatenate([beta[:, :half], -beta[:, half:]], axis=1)
-        forces = (weight * (energy * first - force * second * farther))[:, None] * thicker
-        turned = np.where(at.free, slid / np.where(at.free, A, 1.0), 0.0)
-        forces[:, half:] -= (force * weight * first * turned)[:, None] * self._curves.table(1, at.X)[1]
-        np.add.at(by_half, nodes, forces)
-        return by_half
-
-    def _by_weights(self, w: Array, energy: float, force: float) -> Array:
-        """By the undeformed places of nodes (nodes, 2), as far as the weights of points depend on them."""
-        at, nodal = self._pressed(), np.zeros_like(self._r0)
-        value, first, _ = self._penalty(at)
-        _, n, beta, nodes = self._geometry(at)
-        farther = np.einsum("nk,ni,nki->n", beta, n, w[nodes])
-        per_weight = self._rule.weight[at.point] / 2 * (energy * value - force * first * farther)
-        own = self._nodes[self._rule.cell[at.point]]
-        shape, slope = self._curves.table(1, self._rule.shape[at.point] @ self._curves.element.points.ravel())
-        (rho, _), tangent = (np.einsum("nk,nki->in", table, self._r0[own]) for table in (shape, slope))
-        forces = slope[..., None] * (tangent / np.sum(tangent * tangent, axis=0)).T[:, None]
-        forces[..., 0] += shape / rho[:, None]
-        np.add.at(nodal, own, per_weight[:, None, None] * forces)
-        return nodal
+    def _present(self) -> Present:
+        at = self._pressed()
+        each, one = np.arange(len(at.point)), np.ones(len(at.point))
+        joined = Joined(each, each, at.distance, one, one == 0)
+        of_all = self._curves, self._r0, self._at, self._faces, self._rule, at, joined, self._penalty(at)
+        return PresentMeridian(*of_all, self._forces(), self._by_parts, self._entries, self._geometry)
 
     # what is seen
 
@@ -189,10 +185,11 @@ class MeridianTouching(ContactTerm):
         """Over R; nan where no places face each other within the reach."""
         u = self._now()
         x, (one, other) = self._x_of(r := self._placed(u)), (np.unique(self._nodes[side]) for side in self._sides)
-        first = self._rule.first
-        ways = [x[first][:, None] - r[other], x[~first][:, None] - r[one]]
-        to_nodes = min(float(distances(way).min()) for way in ways)  # no place is farther
-        least = self._found(u, min(self._far, to_nodes * (1 + SAME))).distance.min(initial=np.inf)
+        first, to_nodes = self._rule.first, self._far
+        if not self._around:  # no place is farther than nodes
+            ways = [x[first][:, None] - r[other], x[~first][:, None] - r[one]]
+            to_nodes = min(float(distances(way).min()) for way in ways) * (1 + SAME)
+        least = self._found(u, min(self._far, to_nodes)).distance.min(initial=np.inf)
         return float(least - self._h) if np.isfinite(least) else np.nan
 
     def penetration(self) -> float:
@@ -208,10 +205,15 @@ class MeridianTouching(ContactTerm):
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
-        one, other = (np.intersect1d(held, self._nodes[side]) for side in self._sides)
-        r, half = self._r0 + u, self._half
-        away = np.linalg.norm(r[one][:, None] - r[other], axis=2) - half[one][:, None] - half[other]
-        return float(away.min(initial=np.inf))
+        if self._faces and not self._faces.constant:
+            return np.inf
+        one, other = self._sides
+
+        def may(i: Longs, j: Longs) -> Inside:
+            fits = one[i] & other[j] | other[i] & one[j]
+            return np.asarray(fits & ~self._around.near(i, j) if self._around else fits)
+
+        return between_held(held, self._nodes, self._r0, u, self._half, may)
 
     def refuse_overlap(self) -> None:
         """See that the shells do not overlap undeformed.
@@ -246,7 +248,7 @@ class MeridianTouching(ContactTerm):
 
         Between two looks none moves, relative to another, by more than a part of the least thickness.
         """
-        moved, least = v - u, self._thinnest
+        moved, least = v - u, 2 * min(float(self._half_at(each)[self._touched].min()) for each in (0 * u, u, v))
         moved = moved - [0.0, moved[:, 1].mean()]
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
         ways = (u + k / looks * (v - u) for k in range(1, looks))
@@ -264,8 +266,10 @@ class MeridianTouching(ContactTerm):
     def along(self, moved: Array) -> Along:
         """See `InSteps`."""
         at = self._pressed()
+        if self._faces:
+            moved = np.column_stack([moved, self._faces.change(self._at, moved)])
         _, n, beta, nodes = self._geometry(at)
-        moves = -np.einsum("nk,ni,nki->n", beta, n, moved[nodes])
+        moves = -np.einsum("nki,nki->n", slope_of(n, beta, moved.shape[1]), moved[nodes])
         deep, soft = self._h - at.distance, SOFT * self._h
         return Along.of(len(self._rule.weight), at.point, deep, moves, self.stiffness.value, soft)
 
@@ -276,12 +280,13 @@ class MeridianTouching(ContactTerm):
 
     def _pressed(self) -> Faced:
         """The places that are pressed at the present state."""
-        u = self._now()
+        u, grown = self._now(), self._faces.value if self._faces else 0.0
         if self._about:
             self._at, at = np.array(u), self._about[0]
             return self._followed(at) if len(at.point) else at
-        if not np.array_equal(u, self._at):
-            self._at, self._places = self._looked_at.of((u,), lambda: self._facing(np.array(u)))
+        if grown != self._grown or not np.array_equal(u, self._at):
+            self._at, self._places = self._looked_at.of((u, grown), lambda: self._facing(np.array(u)))
+            self._grown = grown
         return self._places
 
     def _facing(self, u: Array) -> tuple[Array, Faced]:
@@ -314,7 +319,10 @@ class MeridianTouching(ContactTerm):
 
     def _placed(self, u: Array, *, faces: bool = True) -> Array:
         """All nodes (nodes, 3), with half the thickness less h/2, or nothing, as the third component."""
-        return np.column_stack([self._r0 + u, (self._half - self._h / 2) * faces])
+        return np.column_stack([self._r0 + u, (self._half_at(u) - self._h / 2) * faces])
+
+    def _half_at(self, u: Array) -> Array:
+        return self._faces.half(u) if self._faces else self._half
 
     def _x_of(self, r: Array) -> Array:
         """The points, with the third component of the other sign, see `distances`."""
@@ -331,7 +339,7 @@ class MeridianTouching(ContactTerm):
         if not len(point):
             return nowhere()
         at = self._curves.projected(x, nodal, point, cell)
-        return self._curves.nearest(at.of(at.distance < of_faces), x, nodal)
+        return self._curves.nearest(at.of(at.distance < of_faces), x, nodal, self._around)
 
     def _left_to_edges(self, at: Faced) -> Inside:
         """Which places do not count: those of points inside a shell that face the end of another one, steeply.
@@ -345,51 +353,55 @@ class MeridianTouching(ContactTerm):
         return np.asarray(at_end & (level < STEEP) & ~self._rule.on_edge[at.point])
 
     def _geometry(self, at: Faced) -> tuple[Array, Array, Array, Longs]:
-        """x - y, n, and beta (n, functions of both cells) with its nodes."""
+        """Distances, normals, and beta (n, functions of both cells) with its nodes."""
         nodes = np.concatenate([self._nodes[self._rule.cell[at.point]], self._nodes[at.cell]], axis=1)
         r = self._r0 + self._at
         N, shape = self._rule.shape[at.point], self._curves.table(0, at.X)[0]
         beta = np.concatenate([N, -shape], axis=1)
         off = np.einsum("nk,nki->ni", beta, r[nodes])
-        return off, off / np.linalg.norm(off, axis=1)[:, None], beta, nodes
-
-    def _rows(self, at: Faced, off: Array, n: Array, beta: Array) -> tuple[Array, Array, Array]:
-        """By (U, V, W) at the nodes of both cells, (n, functions, 3): d,u, and C_s; and A (n,)."""
-        r = self._placed(self._at)
-        jets, half = self._curves.jets(at.X, r[self._nodes[at.cell]]), beta.shape[1] // 2
-        along = jets[1, :, :2] - np.sum(jets[1, :, :2] * n, axis=1)[:, None] * n
-        normal, slide = np.zeros((2, *beta.shape, 3))
-        normal[..., ::2] = beta[..., None] * n[:, None]
-        slide[..., ::2] = -beta[..., None] * along[:, None]
-        slide[:, half:, ::2] -= self._curves.table(1, at.X)[1][..., None] * off[:, None]
-        return normal, slide, slopes(self._x_of(r)[at.point], jets)[1]
+        d = np.linalg.norm(off, axis=1)
+        return d, off / d[:, None], beta, nodes
 
     def _second(self, m: float) -> tuple[Array, Longs]:
-        """(n, dofs, dofs) by (U, V, W) at the nodes of both cells, over the whole circumference."""
+        """(n, dofs, dofs) by (U, V, W, H) at the nodes of both cells, over the whole circumference."""
         at = self._pressed()
         _, first, second = self._penalty(at)
-        off, n, beta, nodes = self._geometry(at)
-        count, functions = beta.shape
-        half, d = functions // 2, np.linalg.norm(off, axis=1)
-        weight = self._rule.weight[at.point] / 2
-        bent = -weight * first / d
-        normal, slide, A = self._rows(at, off, n, beta)
-        y = self._curves.jets(at.X, (self._r0 + self._at)[self._nodes[at.cell]])[0]
-        turn = np.zeros((count, functions, 3))
+        d, n, beta, nodes = self._geometry(at)
+        off, (count, functions) = d[:, None] * n, beta.shape
+        half, weight, r = functions // 2, self._rule.weight[at.point] / 2, self._placed(self._at)
+        jets, (shape, along) = self._curves.jets(at.X, r[self._nodes[at.cell]]), self._curves.table(1, at.X)
+        A = slopes(self._x_of(r)[at.point], jets)[1]
+        y, across = jets[0], jets[1, :, :2] - np.sum(jets[1, :, :2] * n, axis=1)[:, None] * n
+        rows = np.zeros((4, *beta.shape, 4))
+        normal, way, slide, turn = rows
+        normal[..., IN_PLANE] = way[..., IN_PLANE] = beta[..., None] * n[:, None]
+        normal[..., 3] = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
+        slide[..., IN_PLANE] = -beta[..., None] * across[:, None]
+        slide[:, half:, IN_PLANE] -= along[..., None] * off[:, None]
+        slide[:, half:, 3] -= along * d[:, None]
         turn[..., 1] = -beta * y[:, :1]
-        shape = -beta[:, half:]
         turn[:, half:, 0] += m * off[:, :1] * shape
         turn[:, half:, 1] += off[:, :1] * shape
         turn[:, half:, 2] += m * off[:, 1:] * shape
-        B = y[:, 0] * (y[:, 0] + off[:, 0])
+        turn[:, half:, 3] += m * d[:, None] * shape
+        B, bent = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
         inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
-        rows = np.stack([each.reshape(count, 3 * functions) for each in (normal, slide, turn)], axis=1)
-        factors = np.column_stack([weight * second - bent, -bent * inverse[0], -bent * inverse[1]])
-        H = rows.transpose(0, 2, 1) @ (factors[..., None] * rows)
+        flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
+        factors = np.column_stack([weight * second, -bent, -bent * inverse[0], -bent * inverse[1]])
+        H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
         both = bent[:, None, None] * beta[:, :, None] * beta[:, None]
         for i in range(3):
-            H[:, i::3, i::3] += both
+            H[:, i::4, i::4] += both
         return H, nodes
+
+
+class PresentMeridian(Present):
+    """A contact on a meridian at a state."""
+
+    def of_weights(self, tables: Array, places: Array) -> Array:
+        slopes = tables[1][..., None] * (places[1] / np.sum(places[1] ** 2, axis=1)[:, None])[:, None]
+        slopes[..., 0] += tables[0] / places[0, :, :1]
+        return np.asarray(slopes)
 
 
 def touchings(
@@ -400,24 +412,31 @@ def touchings(
     h: float,
     degree: int,
     thickness: fem.Function | None = None,
+    thins: Array | int = 0,
+    natural: Grown | None = None,
 ) -> list[MeridianTouching]:
-    """The contacts of pairs of shells; of `thickness` see `MeridianTouching`.
+    """The contacts of pairs; of what they are made of see `building.touchings`.
 
     Raises
     ------
     MeshError
-        If a pair overlaps undeformed.
+        If shells of a pair overlap undeformed.
     """
-    made = list[MeridianTouching]()
+    V, made, placed = r0.function_space, list[MeridianTouching](), np.array(r0.x.array.reshape(-1, 2))
+    element, nodes = V.element.basix_element, V.dofmap.list.astype(np.int64)
+    curves, named = Curves(element, nodes, placed, h), {WHOLE: np.ones(len(nodes), dtype=bool), **patches}
+    thinning, times, faces = np.broadcast_to(np.asarray(thins) > 0, (len(nodes), 1))[:, 0], np.ones(nodes.shape), None
+    if thickness is not None:
+        times = thickness.x.array[thickness.function_space.dofmap.list]
+    if thickness is not None or thinning.any():
+        faces = Rings(curves, placed, h, np.array([times]), thinning)
+        if natural and natural.stretch is not None:
+            rates = natural.volumes(faces.tangents(), element.points)
+            rates[:, ~thinning] = np.eye(4)[0][:, None, None]
+            faces = Rings(curves, placed, h, times * rates, thinning, natural.stretch)
+    shape = Shape(r0, thickness, nodes, slice(None))
     for pair in pairs:
-        one, other = (patches[name] for name in pair.names)
-        made.append(MeridianTouching(pair, r0, u, (one, other), h, degree, thickness))
+        one, other = (named[name] for name in pair.names)
+        made.append(MeridianTouching(pair, curves, placed, u, (one, other), h, degree, shape, faces))
         made[-1].refuse_overlap()
     return made
-
-
-def _entries(H: Array, nodes: Longs, size: int) -> Entries:
-    """Blocks (n, dofs, dofs) by the unknowns at nodes (n, functions), `size` at each."""
-    dofs = (size * nodes[..., None] + np.arange(size)).reshape(len(nodes), size * nodes.shape[1])
-    rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
-    return rows.ravel(), columns.ravel(), H.ravel()

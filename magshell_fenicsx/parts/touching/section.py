@@ -9,15 +9,12 @@ from pydantic import Discriminator, Field, Tag
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
-    from magshell_fenicsx.shape.outline import Outline
 
 WHOLE = "shell"
-KEEP_THICKNESS = ("koiter", "laminate")  # laws
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
 Both = Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]
 
@@ -69,6 +66,10 @@ class Pair:
     bound: float = 1e-3
     given: bool = False
 
+    def has(self, shell: str) -> bool:
+        """Whether one of several shells with this name may touch."""
+        return shell in self.names or WHOLE in self.names
+
     @property
     def setting(self) -> str:
         """Name of its stiffness in a state; no name of a user has a space."""
@@ -92,18 +93,6 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
 
     def refuse_unfit(self, context: Context) -> None:
         refuse_unfit_pairs(self.given, context)
-
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """All planes: a half sees its image. The meridian where shells that keep their thickness touch each other."""
-        several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        pairs = [names_in(pair) for pair in self.given]
-        names, laws = {name for pair in pairs for name in pair}, several.laws if several else {}
-        why = None
-        if not names <= {*laws} or any(one == other for one, other in pairs):
-            why = "contact: a shell that may touch itself is modelled with its circumference"
-        elif any(laws[name] not in KEEP_THICKNESS for name in names):
-            why = "contact: shells that get thinner as they stretch are modelled with their circumference"
-        return [Leaves(why)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None

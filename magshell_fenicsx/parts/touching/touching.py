@@ -16,7 +16,7 @@ Where the thickness varies, half of it H at nodes is a fourth unknown: d is then
 plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from dolfinx import fem
@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.connected import add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
-from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.parts.gap import SOFT, penalty
-from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place, with_growth
+from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, on_nodes, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number, of_each
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
@@ -84,15 +83,15 @@ class Touching(ContactTerm):
         shape: Shape,
         faces: Faces | None = None,
     ) -> None:
-        super().__init__(pair)
+        super().__init__(pair, shape, faces)
         self.cuts, rule = Number(0.0), segments.rule
         self._cells, self._rule, self._segments, self._h = cells, rule, segments, h
         self._r0, self._u, self._own, self._local, self._comm = r0, u, own, local, comm
-        self._faces, self._parts = faces, 4 if faces else 3  # of vectors, see `nearest`
+        self._parts = 4 if faces else 3  # of vectors, see `nearest`
         self._facing = Facing(cells, rule, allowed, h, r0, faces, comm)
-        self._touched, self._shape = nodes, shape
+        self._touched = nodes
         self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
-        self._at: Array = np.full_like(r0, np.nan)  # the displacement of the places
+        self._at = np.full_like(r0, np.nan)
         self._grown = 0.0  # the natural stretch there
         self._cuts = Cuts(segments, self._near, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
@@ -111,10 +110,6 @@ class Touching(ContactTerm):
     def energy(self) -> float:
         at, joined, (value, _, _) = self._pressed()
         return float(self._points.weight[at.point[joined.first]] @ value) / 2
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        of_looks = of_each(self, lambda: self._on_nodes(self._forces()))
-        self._add(b, factor * np.sum(of_looks, axis=0))
 
     def _entries(self) -> Entries:
         """Those of the present state, once for the tangent and its products; of looks each time."""
@@ -143,13 +138,6 @@ class Touching(ContactTerm):
         nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
-    # by what grows
-
-    def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
-        """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
-        grown = self._faces.grown if self._faces else None
-        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
-
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
@@ -168,9 +156,6 @@ class Touching(ContactTerm):
         of_all = self._cells, self._r0, self._at, self._faces, self._points
         found = self._by_parts, self._entries, self._geometry
         return Present(*of_all, places, joined, pressed, self._forces(), *found)
-
-    def _on_nodes(self, forces: Array) -> Array:
-        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 3) of this rank's points; collective."""
@@ -327,7 +312,7 @@ class Touching(ContactTerm):
         """See `InSteps`."""
         at, joined, _ = self._pressed()
         if self._faces:
-            moved = np.column_stack([moved, self._faces.half(self._at + moved) - self._faces.half(self._at)])
+            moved = np.column_stack([moved, self._faces.change(self._at, moved)])
         _, n, beta, nodes = self._geometry(at)
         moves = -np.einsum("nki,nki->n", slope_of(n, beta, self._parts), moved[nodes])
         moves = np.bincount(joined.group, joined.weight * moves, len(joined.first))
