@@ -233,11 +233,15 @@ class MeridianTouching(ContactTerm):
             )
 
     def of_cells(self) -> tuple[Array, Array]:
-        """The mean pressure over E h/R^2, and the least gap over R within the reach, of all cells."""
+        """The mean pressure over E h/R^2, and the least gap over R within the reach, of all cells; see `Touching`."""
         at, count = self._pressed(), len(self._nodes)
         cell, weight = self._rule.cell, self._rule.weight
-        area = np.bincount(cell, weight, count)
-        force = np.bincount(cell[at.point], weight[at.point] * self._penalty(at)[1], count)
+        area, size = np.bincount(cell, weight, count), weight[at.point] * self._penalty(at)[1]
+        at_end, steep = self._at_ends(at)
+        alone = steep & ~at_end
+        force = np.bincount(cell[at.point], size * (1 - alone / 2), count) + np.bincount(
+            at.cell, size / 2 * alone, count
+        )
         gap = np.full(count, self._far - self._h)
         near = self._found(self._now(), self._far)
         np.minimum.at(gap, cell[near.point], near.distance - self._h)
@@ -347,10 +351,15 @@ class MeridianTouching(ContactTerm):
         The end's own point is there too; see `facing.Facing.left_to_edges`. Normals are undeformed ones, so that the
         energy is a function of the state.
         """
+        at_end, steep = self._at_ends(at)
+        return np.asarray(at_end & steep & ~self._rule.on_edge[at.point])
+
+    def _at_ends(self, at: Faced) -> tuple[Inside, Inside]:
+        """Which places are at a free end, and which are in a cell that is steep to their point's."""
         end = (at.X == 1.0).astype(np.int64)
         at_end = ~at.free & (self._curves.beside[at.cell, end] < 0)
         level = np.abs(np.sum(self._rule.normal[at.point] * self._normals[at.cell], axis=1))
-        return np.asarray(at_end & (level < STEEP) & ~self._rule.on_edge[at.point])
+        return np.asarray(at_end), np.asarray(level < STEEP)
 
     def _geometry(self, at: Faced) -> tuple[Array, Array, Array, Longs]:
         """Distances, normals, and beta (n, functions of both cells) with its nodes."""

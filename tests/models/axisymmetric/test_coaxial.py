@@ -171,6 +171,36 @@ def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]
     assert wave @ Q @ wave == pytest.approx(v @ K @ v / 2, rel=1e-12)
 
 
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+def test_an_edge_presses_on_a_face(symmetry: str) -> None:
+    """The pressure over each of both shells is the contact force."""
+    disc = cap(polar=10)
+    top = np.sqrt(1 - 0.1**2) - 1.01 * h
+    tube = {
+        "geometry": "cylinder",
+        "radius": 0.1,
+        "length": 0.1,
+        "thickness": h,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0,
+    }
+    tube = {"shell": tube, "boundary": {"bottom": "clamped"}}
+    shells = {"disc": disc, "tube": tube | {"place": {"position": [0, 0, top - 0.1]}}}
+    data = {"shells": shells, "contact": [["disc", "tube"]], "symmetry": symmetry, "loading": PRESSURE}
+    scene = Scene(Case.from_source(data | {"mesh": {"degree": 2, "size": 0.04}}))
+    model = scene.model
+    u = np.zeros((model.system.size // model.V.dofmap.bs, model.V.dofmap.bs))
+    of_shells = model.meridian.patches if model.axisymmetric else model.midsurface.patches
+    u[np.unique(model.V.dofmap.list[of_shells["tube"]]), -1] = 0.02 * h
+    (contact,), at = model.touchings, model.system.at(State(u.ravel(), scene.unloaded().mu))
+    pressure, force = at.of(contact.of_cells)[0], at.of(contact.force)
+    points = contact._rule if model.axisymmetric else contact._points
+    area = np.bincount(points.cell, points.weight, len(pressure))
+    assert force > 0
+    for inside in of_shells.values():
+        assert (pressure * area)[inside].sum() == pytest.approx(force, rel=1e-12)
+
+
 @pytest.mark.parametrize(("m", "factor"), [(1, None), (2, None), (2, "1.5 - 4*(x**2 + y**2)")])
 def test_waves_of_contact(m: int, factor: str | None) -> None:
     """The second variation along a wave, of half the thickness too, is that of the distances of its points in space."""
