@@ -26,7 +26,7 @@ from magshell_fenicsx.mesh.patch import (
 )
 
 Array = NDArray[np.float64]
-MEET = 1e-6  # of the extent: how far vertices that meet may be apart
+MEET = 1e-5  # of the extent: how far vertices that meet may be apart; curved edges are that far from a coarse mesh
 NEARLY = 1e-5  # of a side: a place so near to its end is there
 ROUNDS = 40  # of the search for the nearest place of a side
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
