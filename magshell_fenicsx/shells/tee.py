@@ -210,7 +210,7 @@ class Tee(Tie):
         on_other = self._shapes(Y)
         both = np.concatenate([nodes[cell], nodes[other]], axis=1)
         of_cells = self._of_all.gathered(stiffness)
-        half, axes = nodes.shape[1], np.eye(3)
+        half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
         D = np.zeros((len(x), 4, both.shape[1]))
         D[:, :2, :half], D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (on_edge, on_other))
         beta = np.concatenate([on_edge[0], -on_other[0]], axis=1)
@@ -218,9 +218,9 @@ class Tee(Tie):
             joint,
             r0,
             u,
-            (3 * both[:, :, None] + np.arange(3)).reshape(len(x), 3 * both.shape[1]),
-            np.einsum("nk,cd->nckd", beta, axes).reshape(len(x), 3, -1),
-            np.einsum("nik,cd->nickd", D, axes).reshape(len(x), PARTS, -1),
+            (3 * both[:, :, None] + np.arange(3)).reshape(len(x), count),
+            np.einsum("nk,cd->nckd", beta, axes).reshape(len(x), 3, count),
+            np.einsum("nik,cd->nickd", D, axes).reshape(len(x), PARTS, count),
             along,
             _stiff(joint, material, np.maximum(of_cells[cell], of_cells[other]), length, weight),
             log,
