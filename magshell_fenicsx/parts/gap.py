@@ -82,10 +82,13 @@ def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
     return value, first, second
 
 
-def expanded(s: Array, about: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
-    """Its Taylor polynomial of third order about other penetrations, and the derivatives of that."""
+def expanded(s: Array, about: Array, k: float, soft: float, *, bends: bool = False) -> tuple[Array, Array, Array]:
+    """Its Taylor polynomial of second order about other penetrations, or of third, and the derivatives of that.
+
+    Differences over a part of `soft` are better by that of second order; the derivative of `second` needs the third.
+    """
     value, first, second = penalty(about, k, soft)
-    more, third = s - about, np.where((about > 0) & (about <= soft), k / soft, 0.0)
+    more, third = s - about, bends * np.where((about > 0) & (about <= soft), k / soft, 0.0)
     bend = second + more * third
     return (
         value + more * (first + more * (second / 2 + more / 6 * third)),

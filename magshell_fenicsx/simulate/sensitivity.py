@@ -276,7 +276,10 @@ def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
     of_one: Sequence[Any] = scene.model.touchings
     of_other: Sequence[Any] = other.model.touchings
     for touching, same in zip(of_one, of_other, strict=True):
-        same.expand_about(touching.held or at.of(touching.pressed))
+        if touching.held:
+            same.hold(touching.held)
+        else:
+            same.expand_about(at.of(touching.pressed))
 
 
 def to_shells(stage: Stage, fold: Fold) -> dict[str, float]:

@@ -50,8 +50,8 @@ class Expanded:
         area = _area(self.cells, r0, self.points)
         return replace(self, points=replace(self.points, weight=self.points.weight * area / self.area), area=area)
 
-    def at(self, facing: Facing, u: Array, k: float, h: float) -> tuple[Places, Joined, Penalty]:
-        """The places at a displacement, how they are joined, and the penalty; h is the mean thickness."""
+    def at(self, facing: Facing, u: Array, k: float, h: float, *, bends: bool) -> tuple[Places, Joined, Penalty]:
+        """The places at a displacement, how they are joined, and the penalty `expanded`; h is the mean thickness."""
         at, joined, cells = self.places, self.joined, self.cells
         if not len(at.point):
             return at, joined, penalty(self.depth, k, SOFT * h)
@@ -65,7 +65,7 @@ class Expanded:
         weight = joined.weight * (1 - (change - mean[joined.group]) / (BLUR * h))
         joined = replace(joined, distance=joined.distance + mean, weight=weight)
         at = replace(at, X=X, distance=distance, way=off / np.linalg.norm(off, axis=1)[:, None])
-        return at, joined, expanded(h - joined.distance, self.depth, k, SOFT * h)
+        return at, joined, expanded(h - joined.distance, self.depth, k, SOFT * h, bends=bends)
 
 
 def _area(cells: Cells, r0: Array, points: Points) -> Array:

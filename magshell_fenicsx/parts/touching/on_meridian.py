@@ -299,7 +299,8 @@ class MeridianTouching(ContactTerm):
 
     def _penalty(self, at: Faced) -> tuple[Array, Array, Array]:
         if self._about:
-            return expanded(self._h - at.distance, self._about[1], self.stiffness.value, SOFT * self._h)
+            given = self._h - at.distance, self._about[1], self.stiffness.value, SOFT * self._h
+            return expanded(*given, bends=self.held is not None)
         pressed = penalty(self._h - at.distance, self.stiffness.value, SOFT * self._h)
         return self.look.of(at.point, pressed) if self.look else pressed
 

@@ -392,7 +392,8 @@ class Touching(ContactTerm):
         with its derivatives by the penetration."""
         if self._about:
             self._at, self._points = np.array(self._now()), self._about.points
-            return self._about.at(self._facing, self._at, self.stiffness.value, self._h)
+            given = self._facing, self._at, self.stiffness.value, self._h
+            return self._about.at(*given, bends=self.held is not None)
         u, grown = self._now(), self._faces.value if self._faces else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
