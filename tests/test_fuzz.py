@@ -1,6 +1,7 @@
 """Mutated case files: each is refused with a message, or works; none ends in a traceback or hangs."""
 
 import time
+import traceback
 from collections import Counter
 from pathlib import Path
 
@@ -26,7 +27,8 @@ def invoke(*arguments: str, limit: float) -> int:
     for _ in range(2):
         start = time.perf_counter()
         done = CliRunner().invoke(app, list(arguments))
-        assert done.exception is None or isinstance(done.exception, SystemExit), repr(done.exception)
+        raised = "".join(traceback.format_exception(done.exception))
+        assert done.exception is None or isinstance(done.exception, SystemExit), raised
         late = time.perf_counter() - start >= limit
         if not late:
             break

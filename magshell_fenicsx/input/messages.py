@@ -98,6 +98,8 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         keys = about[1].split(".")
         location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"
+    if kind == "list_type":
+        said = "must be a list, in brackets"
     if kind == "dict_type":
         said = f"must be a mapping, as {{{_example(value, location, source.data, case)}}}"
     if kind == "extra_forbidden":

@@ -217,9 +217,15 @@ class Carrier:
 
     def ds(self, facets: Facets) -> ufl.Measure:
         """Of some edges of the boundary."""
-        dimension = self.mesh.topology.dim - 1
-        tags = mesh.meshtags(self.mesh, dimension, facets, np.ones_like(facets))
-        return ufl.Measure("ds", domain=self.mesh, subdomain_data=tags, metadata=self._along_edges)(1)
+        return self.each_ds([facets])[0]
+
+    def each_ds(self, parts: Sequence[Facets]) -> list[ufl.Measure]:
+        """Of some parts of the boundary that do not overlap, each of one measure: a form may have one alone."""
+        facets = np.concatenate(parts)
+        numbers, order = np.repeat(np.arange(1, len(parts) + 1), [len(each) for each in parts]), np.argsort(facets)
+        tags = mesh.meshtags(self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32))
+        ds = ufl.Measure("ds", domain=self.mesh, subdomain_data=tags, metadata=self._along_edges)
+        return [ds(number) for number in range(1, len(parts) + 1)]
 
     @property
     def _along_edges(self) -> dict[str, int]:

@@ -178,6 +178,13 @@ def of_shape(shell: "ShellSection | Surface", outline: "Outline") -> Leaves:
     return Leaves(reason, mirrors=mirrors)
 
 
+def of_patches(key: str, names: Iterable[str], shell: "ShellSection | Surface") -> Leaves:
+    """A patch of a shell is known on surfaces alone, as is the message about one that is not there."""
+    assembly = getattr(shell, "assembly", None)
+    patch = next((name for name in sorted(names) if assembly and name not in assembly.laws), None)
+    return Leaves(f"{key}: {patch}: is no whole shell" if patch else None)
+
+
 def of_points(points: Iterable[Sequence[float]], R: float, outline: "Outline") -> Leaves:
     """Named points lie on the half that is modelled, and so does the one that is reported without any."""
     named = [np.array(x) / R for x in points]

@@ -301,7 +301,7 @@ def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, s
 
     What two supports hold does not give way. Nodes stand for it, so that edges which cross are not seen.
     """
-    model, comm, dim = scene.model, scene.comm, 2 if scene.model.axisymmetric else 3
+    model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
     if name not in scene.motions or not model.touchings:
         return end, ""
     fixed = np.zeros(model.system.size, dtype=bool)

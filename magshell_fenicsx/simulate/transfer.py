@@ -160,7 +160,8 @@ def of_shells(source: Scene, target: Scene) -> Iterator[tuple[NDArray[np.bool_],
 
 def all_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     """Which of the nodes of all ranks are of each shell; collective."""
-    return [np.concatenate(scene.comm.allgather(inside)) for inside in nodes_of_shells(scene)]
+    comm = scene.model.system.comm
+    return [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(scene)]
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:

@@ -133,7 +133,7 @@ def test_two_directions_add_up() -> None:
         ({"acceleration": "9.81 m/s^2"}, "needs density, youngs_modulus and lengths"),
         ({"acceleration": "9.81 m/s"}, "not convertible to metre/second"),
         ({"acceleration": 1.0, "direction": [0, 0, 0]}, "must not be zero"),
-        ({"acceleration": 1.0, "direction": "down"}, "must be a valid list"),
+        ({"acceleration": 1.0, "direction": "down"}, "must be a list, in brackets"),
     ],
 )
 def test_mistakes(keys: dict[str, Any], words: str) -> None:

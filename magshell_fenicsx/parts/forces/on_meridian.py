@@ -1,7 +1,7 @@
 """Loads that keep their direction and leave the rotation, as energies on the meridian that are linear in u."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import ufl
@@ -10,7 +10,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.carriers import Carrier, Energy
+from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, Force, PointForce
@@ -28,15 +28,33 @@ class Around:
 
     meridian: Meridian
     carrier: Carrier
+    parts: Sequence[Facets] = ()
+    measures: Sequence[ufl.Measure] = ()
+
+    def with_parts(self, loads: Sequence[DeadLoad]) -> "Around":
+        """With one measure for the ends and points of all loads of a form."""
+        parts = list[Facets]()
+        for load in forces(loads):
+            if isinstance(load, AreaForce):
+                continue
+            of = self.meridian.facets_at(load.point) if isinstance(load, PointForce) else self.meridian.ends[load.edge]
+            if not any(np.array_equal(of, part) for part in parts):
+                parts.append(of)
+        return replace(self, parts=parts, measures=self.carrier.each_ds(parts) if parts else [])
+
+    def _ds(self, facets: Facets) -> ufl.Measure:
+        each = zip(self.parts, self.measures, strict=True)
+        return next((ds for part, ds in each if np.array_equal(part, facets)), None) or self.carrier.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
         """Along the undeformed circle of an end, or the mean over that."""
-        ds = self.carrier.ds(self.meridian.ends[name])
+        ds = self._ds(self.meridian.ends[name])
         return lambda f: f / (2 * np.pi) * ds if mean else f * self.carrier.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
         """The value at a point on the axis, over 2 pi."""
-        return lambda f: f / (2 * np.pi) * self.carrier.ds(self.meridian.facets_at(point))
+        ds = self._ds(self.meridian.facets_at(point))
+        return lambda f: f / (2 * np.pi) * ds
 
     def area(self, load: AreaForce) -> Integral:
         """Over the undeformed area, or that of one of several shells."""
@@ -62,7 +80,7 @@ def dead_loads(
 
     Vectors are along e3, and points are on the axis.
     """
-    parts, size, sizes = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form]()
+    parts, size, sizes, on = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form](), on.with_parts(loads)
     for load in forces(loads):
         if isinstance(load, PointForce):
             over = on.pole(load.point)

@@ -17,6 +17,7 @@ from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolved import CapSurface
 from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
+from magshell_fenicsx.shape.symmetry import Leaves, of_patches
 
 BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.point import StepOptions
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.shape.outline import Outline
 
 
 class PressureSection(PathStep):
@@ -58,6 +60,9 @@ class PressureSection(PathStep):
         loads = [other.load for other in context.steps]
         if any(isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads):
             raise ValueError(f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells")
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        return [*super().leaves(step, context, outline), of_patches(f"{step.key}.on", self.on or (), context.shell)]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         sides = {"outside": 1.0, "inside": -1.0}

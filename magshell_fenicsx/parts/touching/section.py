@@ -9,10 +9,12 @@ from pydantic import Discriminator, Field, Tag
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.symmetry import Leaves, of_patches
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
+    from magshell_fenicsx.shape.outline import Outline
 
 WHOLE = "shell"
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
@@ -93,6 +95,11 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
 
     def refuse_unfit(self, context: Context) -> None:
         refuse_unfit_pairs(self.given, context)
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """All, but no meridian of a part of a shell."""
+        names = {name for pair in self.given for name in names_in(pair)} - {WHOLE}
+        return [of_patches("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
