@@ -88,6 +88,17 @@ def test_angle_of_a_crease() -> None:
 
 
 def test_messages() -> None:
+    caps = {
+        name: {"shell": {"geometry": "cap", "radius": 1, "polar": 40, "thickness": 0.02, "poisson_ratio": 0.3}}
+        for name in "ab"
+    }
+    caps["b"] |= {"place": {"position": [0, 0, 2 * np.cos(np.radians(40))], "axis": {"polar": 180}}}
+    caps["a"] |= {"boundary": {"rim": {"held": ["z"]}}}
+    lens = {"shells": caps, "joints": [{"edges": ["a.rim", "b.rim"], "kind": "hinge"}], "loading": {"kind": "pressure"}}
+    with pytest.raises(
+        MeshError, match=r"boundary.a_rim: is joined, by joints.0, and no edge of the surface; its edges"
+    ):
+        Case.from_source(lens).problem()
     with pytest.raises(MeshError, match=r"joints.0.edges: left_right and right_left do not meet, by 0.1 R at \(1.1, "):
         deflected({"kind": "hinge"}, gap=0.1)
     with pytest.raises(

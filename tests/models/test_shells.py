@@ -191,6 +191,9 @@ def test_remanence_of_each() -> None:
         "upper": {"flux_density": "100 mT", "polar": 90},
         "plain": None,
     }
+    on = {"shells": {"lower": cap(), "upper": cap()}, "loading": {"kind": "pressure", "on": {"upper.rim": "inside"}}}
+    with pytest.raises(MeshError, match=r"loading.on: upper_rim: the surface has no such patch, only lower, upper"):
+        Case.from_source(on).problem().triangulated()
     units = {"radius": "10 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
     shells = {}
     for i, (name, remanent) in enumerate(remanents.items()):

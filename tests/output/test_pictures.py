@@ -372,6 +372,21 @@ def test_moments_have_no_displacement_of_their_own() -> None:
         assert curve_figure(path, "load", STYLE).axes[0].get_xlabel() == said
 
 
+def test_unstable_from_the_first_bifurcation_on() -> None:
+    """A mode that the model excludes crosses between two points: the curve is dashed from there, and solid before."""
+    row: Row = {"amplitude": "pressure", "label": "step", "mode": "", "branch": 0, "negative_pivots": 0}
+    places = [("", 0, 0.0), ("", 0, 0.1), ("m = 3", 0, 0.15), ("m = 4", 1, 0.16), ("", 2, 0.2)]
+    path = [
+        row | {"point": i, "mode": mode, "excluded_pivots": count, "p_over_pc": x, "volume_change": -x}
+        | ({"label": "bifurcation"} if mode else {})
+        for i, (mode, count, x) in enumerate(places)
+    ]  # fmt: skip
+    lines = [line for line in curve_figure(path, "pressure", STYLE).axes[0].lines if len(line.get_xdata()) > 2]
+    ends = {line.get_linestyle(): (line.get_xdata()[0], line.get_xdata()[-1]) for line in lines[:2]}
+    assert ends["-"] == pytest.approx((0.0, 0.15), abs=0.005)
+    assert ends["--"] == pytest.approx((0.15, 0.2), abs=0.005)
+
+
 def test_instabilities_are_numbered_along_the_whole_path() -> None:
     """On the curve of the last step too; the legend is above the axes, and nothing is cut off."""
     row: Row = {"amplitude": "pressure", "mode": "", "branch": 0, "negative_pivots": 0, "p_over_pc": 0.0}

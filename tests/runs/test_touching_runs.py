@@ -1,5 +1,6 @@
 """Runs in which a shell touches itself: on several ranks, and interrupted."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -52,3 +53,23 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     again = read_path(tmp_path / "killed")
     for column in ("label", *EXACT):
         assert [row[column] for row in again] == [row[column] for row in one]
+
+
+@pytest.mark.slow
+def test_ranks_of_supports_that_push(tmp_path: Path) -> None:
+    """Two caps on their meridian, of which one is pushed on the other: each rank has all of it, with the same rows."""
+    cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 3, "thickness": 0.02, "poisson_ratio": 0.3}
+    lower = {"shell": cap, "boundary": {"rim": "clamped"}}
+    upper = {"shell": cap, "boundary": {"hole": "clamped"}, "place": {"position": [0, 0, 0.025]}}
+    moves = [{"supports": ["upper.hole"], "translation": [0, 0, -0.01]}]
+    loading = {"kind": "edge", "name": "push", "points": 1, "moves": moves}
+    case = {"shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "loading": loading}
+    (tmp_path / "case.yaml").write_text(json.dumps(case | {"mesh": {"refinement": 0.5, "degree": 3}}))
+    for ranks in (1, 2):
+        run = ["run", str(tmp_path / "case.yaml"), "--no-pictures", "--out", str(tmp_path / str(ranks))]
+        done = all_started([run], ranks)
+        assert done.returncode == 0, done.stderr
+    one, two = (read_path(tmp_path / str(ranks))[-1] for ranks in (1, 2))
+    assert float(one["contact_force"]) > 0
+    for column in ("reaction", "contact_force", "energy"):
+        assert float(two[column]) == pytest.approx(float(one[column]), rel=1e-9), column

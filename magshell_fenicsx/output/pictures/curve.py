@@ -1,7 +1,8 @@
 """The load-displacement or pressure-volume curve as a picture, and natural frequencies along a path."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
 from magshell_fenicsx.output.pictures.lines import (
     FINE,
+    Line,
     Part,
     axes_for,
     drawn_parts,
@@ -158,8 +160,10 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
     for line in lines_of(of):
         curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
         drawn.append(curve)
-        for first, last, unstable in line.pieces:
-            piece = curve[:, first * FINE : last * FINE + 1]
+        crossings = [row for row in of.rows if row["label"] in LOCATED and row not in line.rows]
+        for unstable, pieces in groupby(_pieces(line, curve, crossings, at), key=lambda piece: piece[2]):
+            ends = [(first, last) for first, last, _ in pieces]
+            piece = curve[:, ends[0][0] : ends[-1][1] + 1]
             axes.plot(*piece, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
         dots = [at(row) for row in line.rows if row["label"] in ("target", "step", "field")]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color=colour, markersize=3.5)
@@ -176,6 +180,24 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
             zorder=4,
         )
     return drawn
+
+
+def _pieces(line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceOf) -> Iterator[tuple[int, int, bool]]:
+    """The first and last point of each piece of a smooth curve, and whether it is unstable.
+
+    Between two rows a mode that the model excludes crosses zero at the first or the last of the `crossings` there.
+    """
+    extent = np.ptp(curve, axis=1)[:, None]
+    for i, unstable in enumerate(line.unstable):
+        (row, after), low, high = line.rows[i : i + 2], i * FINE, (i + 1) * FINE
+        within = [it for it in crossings if int(row["point"]) < int(it["point"]) < int(after["point"])]
+        if within and row["label"] not in LOCATED and is_unstable(row) != unstable:
+            at = np.array(place_of(within[0 if unstable else -1]))[:, None]
+            middle = low + int(np.argmin(np.linalg.norm((curve[:, low : high + 1] - at) / extent, axis=0)))
+            yield low, middle, not unstable
+            yield middle, high, unstable
+        else:
+            yield low, high, unstable
 
 
 def hidden(axes: "Axes", of: Part) -> Array | None:

@@ -98,11 +98,17 @@ class Line:
 
     @property
     def unstable(self) -> list[bool]:
-        """Whether each of the segments between the rows is: as its end, or if that is located as its beginning."""
+        """Whether each of the segments between the rows is: as its end, or if that is located as its beginning.
+
+        Between two located rows the number of unstable directions is that of a row, or one more, at both.
+        """
         of_segments: list[bool] = []
         for first, last in pairwise(self.rows):
             rows = [row for row in (last, first) if row["label"] not in LOCATED]
-            of_segments.append(is_unstable(rows[0]) if rows else not (of_segments and of_segments[-1]))
+            a, b = (int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) for row in (first, last))
+            between = {a, a + 1} & {b, b + 1}
+            alternates = not (of_segments and of_segments[-1])
+            of_segments.append(is_unstable(rows[0]) if rows else min(between, default=0) > 0 or alternates)
         return of_segments
 
     @property

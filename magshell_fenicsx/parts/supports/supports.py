@@ -74,26 +74,29 @@ def refuse_unknown(
     """
     joined = {edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges}
 
-    def refuse(key: str, name: str, allowed: Collection[str], no: str = " no such edge,") -> None:
-        there = ", ".join(sorted(allowed)) or "none"
-        said = f"the surface has{no} only {there}"
+    def refuse_joined(key: str, name: str) -> None:
         if name in joined and name not in patches:
-            said = f"is joined, by joints.{joined[name]}, and no edge of the surface any more; these are {there}"
-        raise MeshError(f"{key}: {said}")
+            there, number = ", ".join(sorted(edges)) or "none", joined[name]
+            raise MeshError(f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: {there}")
 
     for name, condition in conditions.items():
         allowed = set(edges)
         allowed |= set(points) - {"pole"} if isinstance(condition, Held) else set()
         allowed |= set(patches) if isinstance(condition, Held) or condition == "clamped" else set()
         if name not in allowed:
-            refuse(f"boundary.{name}", name, allowed)
+            refuse_joined(f"boundary.{name}", name)
+            allowed_names = ", ".join(sorted(allowed)) or "none"
+            raise MeshError(f"boundary.{name}: the surface has no such edge, only {allowed_names}")
     for load in loads.all_dead:
         edge = getattr(load, "edge", None)
         if edge is not None and edge not in edges:
-            refuse(f"loading.loads: edge: {edge}", edge, edges, "")
+            refuse_joined(f"loading.loads: edge: {edge}", edge)
+            allowed_names = ", ".join(sorted(edges)) or "none"
+            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
     for term in loads.own:
         if term.on is not None and term.on not in edges:
-            refuse(f"{term.key or f'terms: {term.name}: on'}: {term.on}", term.on, edges)
+            allowed_names, key = ", ".join(sorted(edges)) or "none", term.key or f"terms: {term.name}: on"
+            raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {allowed_names}")
 
 
 def no_mirror(name: str) -> str:

@@ -120,6 +120,17 @@ def test_named_points_turn_with_the_meridian() -> None:
     assert found["A_ux"] == pytest.approx(0.0, abs=1e-15)
 
 
+def test_loads_on_one_edge_and_on_another() -> None:
+    """Two forces and one per length on an end are one force, beside a moment on the other end."""
+    tube = {"shell": CYLINDER, "boundary": {"bottom": {"held": ["x", "y", "z"]}}}
+    down, up = {"edge": "bottom", "force": [0, 0, -7e-6]}, {"edge": "top", "force": [0, 0, 4e-6]}
+    turned, along = {"edge": "bottom", "moment": 1e-7}, {"edge": "top", "per_length": [0, 0, 2e-6 / (2 * pi)]}
+    several = [up, along, {"edge": "top", "force": [0, 0, 1e-6]}, down, turned]
+    one = [{"edge": "top", "force": [0, 0, 7e-6]}, down, turned]
+    a, b = (ended(tube | {"loading": dead(*loads)}, "auto", {"degree": 3})[1] for loads in (several, one))
+    assert a["energy"] == pytest.approx(b["energy"], rel=1e-9)
+
+
 def test_plate_on_a_pin() -> None:
     """A clamped plate under q, held at its centre: mean deflection q R^4/(768 D), of Timoshenko's two solutions."""
     h, nu, q = 1 / 50, 0.3, 1e-9
