@@ -62,7 +62,7 @@ def test_ranks_of_supports_that_push(tmp_path: Path) -> None:
     lower = {"shell": cap, "boundary": {"rim": "clamped"}}
     upper = {"shell": cap, "boundary": {"hole": "clamped"}, "place": {"position": [0, 0, 0.025]}}
     moves = [{"supports": ["upper.hole"], "translation": [0, 0, -0.01]}]
-    loading = {"kind": "edge", "name": "push", "points": 1, "moves": moves}
+    loading = {"kind": "edge", "name": "way", "points": 1, "moves": moves}
     case = {"shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "loading": loading}
     (tmp_path / "case.yaml").write_text(json.dumps(case | {"mesh": {"refinement": 0.5, "degree": 3}}))
     for ranks in (1, 2):
