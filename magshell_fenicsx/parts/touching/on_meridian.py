@@ -238,10 +238,8 @@ class MeridianTouching(ContactTerm):
         cell, weight = self._rule.cell, self._rule.weight
         area, size = np.bincount(cell, weight, count), weight[at.point] * self._penalty(at)[1]
         at_end, steep = self._at_ends(at)
-        alone = steep & ~at_end
-        force = np.bincount(cell[at.point], size * (1 - alone / 2), count) + np.bincount(
-            at.cell, size / 2 * alone, count
-        )
+        part = np.where(steep & ~at_end, 0.5, 1.0)
+        force = np.bincount(cell[at.point], part * size, count) + np.bincount(at.cell, (1 - part) * size, count)
         gap = np.full(count, self._far - self._h)
         near = self._found(self._now(), self._far)
         np.minimum.at(gap, cell[near.point], near.distance - self._h)
