@@ -141,12 +141,12 @@ class Tie:
         return 0.0
 
     def _second(self, gap: Array, tangents: Array) -> Array:
-        """(n, k, k) the second variation at the present u, along what these make of any k unknowns."""
-        H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
+        """(n, k, k) the second variation at the present u, along what these make of any k unknowns; collective."""
+        H, u = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True), whole(self._u)
         if self._turns and len(H):
             of_parts = np.zeros((len(H), PARTS, PARTS))
             upper = np.triu_indices(PARTS)
-            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", whole(self._u))
+            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", u)
             H += np.einsum("nik,nij,njl->nkl", tangents, of_parts, tangents, optimize=True)
         return np.asarray(H)
 
