@@ -194,6 +194,17 @@ class Observed:
 
         return self.system.at(state).of(present)
 
+    def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
+        """Whether the mean in each local cell is the pressure of a contact there, see `Pressing`."""
+        pressings = [pressing for pressing, _ in self.contacts.values()]
+
+        def present() -> NDArray[np.bool_]:
+            each = [pressing.evenly_pressed() for pressing in pressings]
+            of_shells = [touching.of_cells()[2] for touching in self.touchings]
+            return np.asarray(np.any([*each, *of_shells], axis=0))
+
+        return self.system.at(state).of(present)
+
     def cell_gaps(self, state: State) -> Array | None:
         """The least gap over R in each local cell between parts of the shell, see `Touching`; None without pairs."""
         if not self.touchings:

@@ -30,6 +30,8 @@ SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strain
 MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
 GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
 PRESSURE = "contact_pressure"  # of bodies and of parts of the shell, over E h/R: the mean over a cell
+EVEN, OF_EVEN, OPEN = "evenly_pressed", "pressure_of_even", "open"  # see `resolved_pressure`
+NO_GAP = 1e-2  # over h: of a node that touches
 SHELL = "shell"  # the number of the shell, where there are several
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
@@ -170,7 +172,11 @@ class SurfaceGatherer:
         values = self._fields.of(jet, state.mu)
         pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
+            even = self._model.cells_evenly_pressed(state).astype(np.float64)
             values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
+            values[EVEN] = np.repeat(even[: self._owned, None], len(self._places), axis=1)
+            values[OF_EVEN] = values[PRESSURE] * values[EVEN]
+            values[OPEN] = np.where(values.get(GAP, np.zeros(values[EVEN].shape)) > NO_GAP, 1.0, 0.0)
         gap = self._model.cell_gaps(state) if state.mu else None
         if gap is not None:
             gap = np.repeat(gap[: self._owned, None] / self._model.material.h, len(self._places), axis=1)
@@ -183,6 +189,7 @@ class SurfaceGatherer:
             return None
         smooth, jumps = self._recovered.fields(tensors, self._n0)
         fields = self._constant | smooth | rubber_fields(smooth, law) | averaged
+        fields = resolved_pressure(self._cells, fields)
         names = self._model.midsurface.shells
         return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"], shells=names)
 
@@ -240,6 +247,33 @@ class SurfaceGatherer:
         if self._mean is None:
             return values
         return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(-1, *values.shape[2:])
+
+
+def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dict[str, Array]:
+    """Return the fields with the contact pressure where the mesh resolves it, and nan where not.
+
+    In a cell that is pressed in part its mean is no pressure. Beside one that is pressed all over it is the edge of
+    that zone, which ends where the gap is open; by itself it may be any part of what presses there.
+
+    Parameters
+    ----------
+    cells
+        (m, k) node numbers.
+    fields
+        At nodes, the means of the cells that meet there. Those are taken out: `EVEN`, one of a cell that is pressed
+        all over; `OF_EVEN`, its pressure; `OPEN`, one where there is a gap.
+    """
+    if PRESSURE not in fields:
+        return fields
+    rest = {name: values for name, values in fields.items() if name not in {EVEN, OF_EVEN, OPEN}}
+    near = fields[EVEN] > 0
+    beside = near.copy()
+    beside[cells[near[cells].any(axis=1)]] = True
+    of_even = fields[OF_EVEN] / np.where(near, fields[EVEN], 1.0)
+    at_edge = np.where(beside & (fields[OPEN] > 0), 0.0, rest[PRESSURE])
+    pressure = np.where(near, of_even, at_edge)
+    rest[PRESSURE] = np.where((pressure > 0) & ~beside, np.nan, pressure)
+    return rest
 
 
 def grown(growing: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]) -> list[Deviation]:

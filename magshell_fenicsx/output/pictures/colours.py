@@ -222,19 +222,26 @@ def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
 
 
 def contact(surface: Surface) -> list[Coloured]:
-    """The gap and the pressure of bodies."""
+    """The gap and the pressure of bodies; none where nothing touches or the mesh resolves no pressure."""
     if not {"gap_over_h", "contact_pressure"} <= surface.fields.keys():
         return []
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
-    most = float(pressure.max()) or 1.0
-    return [
-        Coloured("gap_over_h", gap, (0.0, 1.0), NEAR, "gap$/h$"),
-        Coloured("contact_pressure", pressure, (0.0, most), SIGNED, r"contact pressure $pR/(Eh)$"),
-    ]
+    layers = [Coloured("gap_over_h", gap, (0.0, 1.0), NEAR, "gap$/h$")]
+    if (most := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
+        caption = r"contact pressure $pR/(Eh)$"
+        layers.append(Coloured("contact_pressure", pressure, (0.0, most), SIGNED, caption))
+    return layers
 
 
-def few_cells_said(surface: Surface) -> str:
-    """That the drawn pressure is no distribution, where few cells carry it: in each it is a mean."""
+def pressure_said(surface: Surface) -> str:
+    """What the drawn pressure is not: there is none, or it is narrower than a cell, or few cells carry it."""
+    pressure = surface.fields["contact_pressure"]
+    unresolved, most = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
+    if not most:
+        narrow = "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
+        return narrow if unresolved else "Nothing touches."
+    if unresolved:
+        return "Where the contact is narrower than a cell of the mesh, no pressure is drawn."
     number = int((surface.fields["contact_pressure"][surface.cells] > 0).all(axis=1).sum())
     return f"The pressure is a mean over each cell; {number} carry it." if 0 < number < FEW else ""
 

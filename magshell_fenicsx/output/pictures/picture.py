@@ -13,9 +13,9 @@ from magshell_fenicsx.output.pictures.colours import (
     Coloured,
     contact,
     contact_region,
-    few_cells_said,
     loads,
     moments,
+    pressure_said,
     shell,
     strains,
     stretches,
@@ -59,7 +59,7 @@ def _of_contact(surface: Surface) -> Content:
     layers = contact(surface)
     detail = contact_region(surface) if layers else None
     notes = [] if detail is None else ["The part of the shell around the contact."]
-    return Content(layers, " ".join([*notes, few_cells_said(surface)] if layers else []).strip(), detail)
+    return Content(layers, " ".join([*notes, pressure_said(surface)] if layers else []).strip(), detail)
 
 
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {

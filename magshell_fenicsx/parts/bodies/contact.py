@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
 FACE = 1 + 1 + 3 + 1  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
+EVEN = 1.5  # largest over mean pressure in a cell whose mean is drawn, at most
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
 
@@ -375,9 +376,18 @@ class Pressing:
         """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than that of nodes."""
         V = self._u.function_space
         weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
+        return np.asarray(self._sizes() @ weights / weights.sum())
+
+    def evenly_pressed(self) -> NDArray[np.bool_]:
+        """Whether all points of each local cell are pressed, and its mean is near its pressure."""
+        size = self._sizes()
+        even = size.max(axis=1) <= EVEN * self.cell_pressures()
+        return np.asarray((size > 0).all(axis=1) & even)
+
+    def _sizes(self) -> Array:
+        """The pressure at the points of local cells, over E h/R."""
         self.polynomial.renew()
-        size = np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1)
-        return np.asarray(size @ weights / weights.sum())
+        return np.asarray(np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1))
 
     def region(self, comm: MPI.Comm, radius: float) -> Region:
         """Where the body touches; `radius` is the mean one."""

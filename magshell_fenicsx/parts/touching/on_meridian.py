@@ -34,7 +34,7 @@ from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, o
 from magshell_fenicsx.parts.touching.nearest import FOLLOWING, Joined, highest
 from magshell_fenicsx.parts.touching.rings import IN_PLANE, Rings
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
-from magshell_fenicsx.parts.touching.touching import NEARER, PART, REACH
+from magshell_fenicsx.parts.touching.touching import EVERYWHERE, NEARER, PART, REACH
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -232,8 +232,11 @@ class MeridianTouching(ContactTerm):
                 f"contact: {self.pair.words} overlap undeformed, by {by:.4g} h at ({where}) R: move them apart"
             )
 
-    def of_cells(self) -> tuple[Array, Array]:
-        """The mean pressure over E h/R^2, and the least gap over R within the reach, of all cells; see `Touching`."""
+    def of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The mean pressure over E h/R^2, the least gap over R within the reach, and which are pressed all over.
+
+        Of all cells; see `Touching`.
+        """
         at, count = self._pressed(), len(self._nodes)
         cell, weight = self._rule.cell, self._rule.weight
         area, size = np.bincount(cell, weight, count), weight[at.point] * self._penalty(at)[1]
@@ -243,7 +246,8 @@ class MeridianTouching(ContactTerm):
         gap = np.full(count, self._far - self._h)
         near = self._found(self._now(), self._far)
         np.minimum.at(gap, cell[near.point], near.distance - self._h)
-        return force / np.where(area > 0, area, 1.0), gap
+        pressed = np.bincount(cell[np.unique(at.point)], weight[np.unique(at.point)], count)
+        return force / np.where(area > 0, area, 1.0), gap, (area > 0) & (pressed > EVERYWHERE * area)
 
     def through(self, u: Array, v: Array) -> bool:
         """Whether points pass through a curve on the straight way between two displacements (nodes, 2).

@@ -38,6 +38,7 @@ from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
 AHEAD = 1.0  # of the thickness: cells that are nearer than that have room in the tangent
+EVERYWHERE = 1 - 1e-9  # of the area of a cell, but for rounding
 CHUNK = 1000  # blocks of a tangent at a time
 ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
 PART = 0.25  # of the thickness: how far points move between two looks at a step
@@ -236,8 +237,10 @@ class Touching(ContactTerm):
         deep, place = max(self._comm.allgather(mine), key=lambda each: each[0])
         return float(deep), np.asarray(place)
 
-    def of_cells(self) -> tuple[Array, Array]:
-        """The mean pressure over E h/R, and the least gap over R within the reach, of local cells.
+    def of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The mean pressure over E h/R, the least gap over R within the reach, and which are pressed all over.
+
+        Of local cells.
 
         Where an edge alone presses on a face, half of its points' forces acts on each, as the energy has it. Of ghosts
         the pressure is zero and the gap the reach. Collective.
@@ -256,7 +259,10 @@ class Touching(ContactTerm):
         np.add.at(p, points.cell[nearest.point] - start, size * (1 - alone / 2))
         near = self._facing.found(self._now(), self._far, points)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
-        return p / weight, gap
+        pressed = np.zeros(count)
+        some = np.unique(nearest.point)
+        np.add.at(pressed, points.cell[some] - start, points.weight[some])
+        return p / weight, gap, pressed > EVERYWHERE * weight
 
     def halves(self) -> tuple[Array, Array]:
         """Half the undeformed thickness at all nodes, and the present one, over R; collective."""

@@ -1,0 +1,78 @@
+"""The contact pressure in pictures: that of the points, or a statement where cells are too wide for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CASES
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.surface import (
+    EVEN,
+    OF_EVEN,
+    OPEN,
+    PRESSURE,
+    Surface,
+    resolved_pressure,
+)
+from magshell_fenicsx.output.pictures.colours import contact, pressure_said
+from magshell_fenicsx.simulate.follow import follow
+
+
+def end_of(name: str, *settings: str) -> tuple[Scene, State, Surface]:
+    scene = Scene(Case.load(CASES / name, [*settings]))
+    *_, record = follow(scene)
+    state = record.point.state
+    surface = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
+    assert surface is not None
+    return scene, state, surface
+
+
+@pytest.mark.slow
+def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
+    """The rod's edge presses on a ring of 0.02 of a cell; its mean over the cell was drawn, 50 times too small."""
+    _, _, surface = end_of("rod_contact.yaml", "loading.approach=0.5", "loading.points=1")
+    assert np.isnan(surface.fields[PRESSURE]).any()
+    assert not (surface.fields[PRESSURE] > 0).any()
+    assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
+    assert "narrower than a cell" in pressure_said(surface)
+
+
+@pytest.mark.slow
+def test_a_flat_contact_has_the_pressure_of_its_points() -> None:
+    """What is drawn is what the quadrature points have, within the variation of one cell; outside it is zero."""
+    few = "loading.approach=0.8", "loading.points=1", "mesh.refinement=4"
+    scene, state, surface = end_of("plate_contact.yaml", "bodies.plate.stiffness=2e6", *few)
+    pressing, _ = scene.model.contacts["approach"]
+    sizes = scene.model.system.at(state).of(pressing._sizes)
+    drawn = surface.fields[PRESSURE]
+    assert np.nanmax(drawn) == pytest.approx(sizes.max(), rel=0.33)
+    assert (surface.fields["gap_over_h"][drawn > 0] < 0.05).all()
+
+
+def test_pressure_of_cells_pressed_in_part() -> None:
+    """A row of cells: by itself such a cell has none, beside one that is pressed all over it is its edge."""
+    cells = np.array([[i, i + 1, i + 1] for i in range(6)])
+    even, of_cells = np.array([0, 1, 0, 0, 0, 0.0]), np.array([0.2, 1, 0.3, 0, 0, 0.7])
+
+    def at_nodes(values: np.ndarray) -> np.ndarray:
+        return np.array([values[0], *((values[1:] + values[:-1]) / 2), values[-1]])
+
+    fields = {PRESSURE: at_nodes(of_cells), EVEN: at_nodes(even), OF_EVEN: at_nodes(even * of_cells)}
+    fields[OPEN] = np.array([1, 0, 0, 1, 1, 1, 1.0])
+    found = resolved_pressure(cells, fields)
+    assert found.keys() == {PRESSURE}
+    assert found[PRESSURE] == pytest.approx([0, 1, 1, 0, 0, np.nan, np.nan], nan_ok=True)
+
+
+def test_nothing_touches() -> None:
+    """No pressure is drawn, in place of a bar from 0 to 1."""
+    points = np.zeros((3, 3))
+    fields = {PRESSURE: np.zeros(3), "gap_over_h": np.full(3, 2.0)}
+    surface = Surface(points, points, points, np.array([[0, 1, 2]]), fields)
+    assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
+    assert pressure_said(surface) == "Nothing touches."
+    pressed = replace(surface, fields=fields | {PRESSURE: np.array([1.0, 2.0, np.nan])})
+    assert [layer.limits for layer in contact(pressed)][1] == (0.0, 2.0)
