@@ -283,7 +283,7 @@ def supports(
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
-            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL))
+            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), in_plane=True)
             continue
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
