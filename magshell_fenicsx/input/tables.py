@@ -3,8 +3,9 @@
 import csv
 import io
 import re
-import warnings
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
 
@@ -18,12 +19,39 @@ from magshell_fenicsx.platform.reading import Files, arrays, text_of
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")  # x, x [mm] or x (mm)
 LARGEST, MOST_POINTS = 200_000_000, 200_000  # bytes, control points
+GREATEST = 1e30  # measured number; squares of numbers that are larger have no finite sum
 PLACES = {3: ("x", "y", "z"), 2: ("rho", "z")}
 VECTORS = {3: ("bx", "by", "bz"), 2: ("b_rho", "b_z")}
 
 
 class TableError(ValueError):
     """The file cannot be used; the message says what and where, without the file's name."""
+
+
+@dataclass(frozen=True)
+class TableRows:
+    """The rows of a file: columns and their units by name, and the line of each row in the file."""
+
+    columns: Mapping[str, Array]
+    units: Mapping[str, str | None]
+    lines: Sequence[int]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """The cells of a file as numbers, nan where there is none.
+
+    Attributes
+    ----------
+    lines
+        That of each row; empty of arrays.
+    word
+        The first cell that has text in place of a number, as a message has it; "" without.
+    """
+
+    columns: Mapping[str, Array]
+    lines: Sequence[int] = ()
+    word: str = ""
 
 
 def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, str | None]]:
@@ -34,6 +62,34 @@ def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, st
     TableError
         If it cannot be read, or has a column twice.
     """
+    return _by_name(_cells(file, files))
+
+
+def read_rows(file: Path, files: Files) -> TableRows:
+    """Return the same of measured rows, in which a cell is a number, or without one (empty or nan).
+
+    Raises
+    ------
+    TableError
+        With the line of a cell that has text or a number out of bounds; see `read_table` too.
+    """
+    cells = _cells(file, files)
+    columns, units = _by_name(cells)
+    if cells.word:
+        raise TableError(cells.word)
+    lengths = {column.shape for column in columns.values()}
+    if len(lengths) > 1 or any(len(shape) != 1 for shape in lengths):
+        raise TableError("its arrays have different lengths")
+    lines = cells.lines or range(1, 1 + next(iter(lengths))[0])
+    for name, column in columns.items():
+        for row in np.flatnonzero(np.abs(column) > GREATEST)[:1]:
+            raise TableError(
+                f"line {lines[row]}: {name}: {column[row]:g}: allowed are numbers up to {GREATEST:g} in size"
+            )
+    return TableRows(columns, units, lines)
+
+
+def _cells(file: Path, files: Files) -> _Cells:
     try:
         content = files.content(file)
     except OSError as e:
@@ -41,15 +97,23 @@ def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, st
     if len(content) > LARGEST:
         raise TableError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
     try:
-        columns = arrays(content) if file.suffix == ".npz" else _csv_columns(text_of(content))
+        return _Cells(arrays(content)) if file.suffix == ".npz" else _csv_cells(text_of(content))
     except TableError:
         raise
-    except ValueError as e:
+    except (ValueError, csv.Error) as e:
         raise TableError(str(e)) from None
-    units = dict(_name_and_unit(header) for header in columns)
-    if len(units) < len(columns):
-        raise TableError(f"has a column twice: {shorten(', '.join(columns), 200)}")
-    return {name: np.asarray(v, dtype=float) for name, v in zip(units, columns.values(), strict=True)}, units
+
+
+def _by_name(cells: _Cells) -> tuple[dict[str, Array], dict[str, str | None]]:
+    named = [_name_and_unit(header) for header in cells.columns]
+    _refuse_double([name for name, _ in named])
+    values = [np.asarray(v, dtype=float) for v in cells.columns.values()]
+    return {name: v for (name, _), v in zip(named, values, strict=True)}, dict(named)
+
+
+def _refuse_double(names: Sequence[str]) -> None:
+    if len(set(names)) < len(names):
+        raise TableError(f"has a column twice: {shorten(', '.join(names), 200)}")
 
 
 def column_size(name: str, unit: str, of: str) -> float:
@@ -113,21 +177,74 @@ def _name_and_unit(header: str) -> tuple[str, str | None]:
     return (parts[1], parts[2]) if parts else (header, None)
 
 
-def _csv_columns(text: str) -> dict[str, Array]:
-    stream = io.StringIO(text)
-    header = next((line for line in stream if line.strip()), "").lstrip("# ").strip()
-    mark = next((mark for mark in (";", "\t", ",") if mark in header), None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of an empty file
-        try:
-            rows = np.genfromtxt(stream, delimiter=mark, ndmin=2, comments="#")
-        except ValueError as e:
-            raise TableError(f"has rows of different lengths: {str(e).splitlines()[-1].strip()}") from None
-    names = [
-        name.strip() for name in (header.split(mark) if mark else re.findall(r"\w+(?:\s*[\[(][^\])]*[\])])?", header))
-    ]
-    if not names or rows.size == 0:
-        raise TableError("has no rows of numbers below a header such as x,y,z,w0")
-    if rows.shape[1] != len(names):
-        raise TableError(f"has {len(names)} names in its header and {rows.shape[1]} columns")
-    return dict(zip(names, rows.T, strict=True))
+def _csv_cells(text: str) -> _Cells:
+    header, begin = _header(text)
+    mark, names = _mark(header), _names(header)
+    _refuse_double(names)
+    values, lines, word = array("d"), list[int](), ""
+    for line, row in _rows(text, mark, begin):
+        if len(row) != len(names):
+            raise TableError(
+                f"has {len(names)} names in its header and {len(row)} columns in line {line}: every row "
+                "has as many cells as the header, and decimal points"
+            )
+        for name, cell in zip(names, row, strict=True):
+            value = _number(cell)
+            if value is None and not word:
+                word = (
+                    f"line {line}: {name}: {shorten(cell, 40)}: is no number; where nothing was "
+                    "measured the cell is empty"
+                )
+            values.append(np.nan if value is None else value)
+        lines.append(line)
+    if not lines:
+        raise TableError("has no rows of numbers below a header with the names of its columns")
+    rows = np.array(values).reshape(-1, len(names))
+    return _Cells(dict(zip(names, rows.T, strict=True)), lines, word)
+
+
+def _header(text: str) -> tuple[str, int]:
+    """The line with the names, and its number: the first one without a #, or a comment above it if
+    that has numbers."""
+    comments = list[tuple[str, int]]()
+    for number, line in enumerate(io.StringIO(text), 1):
+        bare = line.strip()
+        if bare.startswith("#"):
+            comments.append((bare.lstrip("# "), number))
+        elif bare:
+            cells = [cell for cell in re.split(r"[;,\s]+", bare.replace('"', "")) if cell]
+            if comments and any(_number(cell) is not None for cell in cells):
+                return max(comments, key=lambda each: len(_names(each[0])) == len(cells))
+            return bare, number
+    return "", 0
+
+
+def _mark(header: str) -> str | None:
+    """What separates columns; None: blanks."""
+    return next((mark for mark in (";", "	", ",") if mark in header), None)
+
+
+def _names(header: str) -> list[str]:
+    if mark := _mark(header):
+        return [cell.strip() for cell in next(csv.reader([header], delimiter=mark))]
+    return re.findall(r"[\w.]+(?:\s*[\[(][^\])]*[\])])?", header)
+
+
+def _rows(text: str, mark: str | None, begin: int) -> Iterator[tuple[int, list[str]]]:
+    """Lines below that of the header as rows of cells, without comments and what is empty."""
+    numbered = enumerate(io.StringIO(text), 1)
+    bare = (line.partition("#")[0] if number > begin else "" for number, line in numbered)
+    if mark:
+        reader = csv.reader(bare, delimiter=mark)
+        rows = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
+    else:
+        rows = ((i, line.replace('"', "").split()) for i, line in enumerate(bare, 1))
+    return ((number, row) for number, row in rows if any(row))
+
+
+def _number(cell: str) -> float | None:
+    """That of a cell, nan of an empty one; None of text."""
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        return None

@@ -99,6 +99,12 @@ class Joined(KeyAbility[Sequence[JointSection]]):
                 raise ValueError(
                     f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
                 )
+            edge, other = section.edges
+            if other in shells and edge.startswith(f"{other}_"):
+                others = ", ".join(sorted(set(shells) - {other})) or "none"
+                raise ValueError(
+                    f"joints.{i}: {other}: is the shell of the edge itself, which joins nothing; allowed: {others}"
+                )
             for name in section.edges:
                 if name in shells:
                     continue  # on which several edges may be

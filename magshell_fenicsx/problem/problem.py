@@ -261,6 +261,13 @@ class Problem:
         return not self.programme and self.frequencies is not None
 
     @property
+    def moves_freely(self) -> bool:
+        """Whether the shell moves in time alone, so that it need not be held: its rigid motions cost inertia."""
+        motions = [step.load.motion for step in self.programme]
+        needs_inertia_alone = all(motion is not None and motion.needs_inertia_alone for motion in motions)
+        return bool(motions) and needs_inertia_alone and not (self.frequencies or self.stability)
+
+    @property
     def imperfections(self) -> Mapping[str, ImperfectionSection]:
         """Key of each below `shell` -> its section."""
         return self.context.sections.get("imperfections") or {}

@@ -23,7 +23,7 @@ from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.fields import density
-from magshell_fenicsx.simulate.gradients.gradient import derivative
+from magshell_fenicsx.simulate.gradients.gradient import Gradient, derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
@@ -62,9 +62,11 @@ def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
         assert section
         try:
             kind, adjoint = _adjoint(result, of)
-            slopes = {by: derivative(adjoint, by) for by in section.by}
         except (CaseError, FoldLost, Lost) as e:
             say(f"warning: no gradient of {of}: {e}")
+            continue
+        slopes = _slopes(adjoint, of, section.by, say)
+        if not slopes:
             continue
         fields = {by: each for by, each in slopes.items() if isinstance(each, FieldGradient)}
         numbers = {by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)}
@@ -82,6 +84,17 @@ def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
             say(f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})")
         for by, slope in numbers.items():
             say(f"d {of}/d {by}: {slope:.6g}")
+
+
+def _slopes(adjoint: Adjoint, of: str, names: Sequence[str], say: Say) -> dict[str, Gradient]:
+    """The derivatives of a result by all that it has one by; the others are named; collective."""
+    slopes = dict[str, Gradient]()
+    for by in names:
+        try:
+            slopes[by] = derivative(adjoint, by)
+        except (CaseError, FoldLost, Lost) as e:
+            say(f"warning: no gradient of {of} by {by}: {e}")
+    return slopes
 
 
 def _words(values: Sequence[float], size: float, digits: int) -> str:

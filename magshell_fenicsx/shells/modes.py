@@ -15,7 +15,6 @@ from functools import partial
 import numpy as np
 import ufl
 from dolfinx import fem
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -178,23 +177,23 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
         )
 
     if isinstance(model, MeridianModel):
-        free = model.held.rigid_motions(model.r0) if rest else dict.fromkeys((-1, 0, 1), 0)
-        yield of("", model.system, free[0])
+        free = model.rigid_motions(rest.mu) if rest else {}
+        count = {wave: len(motions) for wave, motions in free.items()}
+        yield of("", model.system, count.get(0, 0))
         waves = model.excluded_modes.waves
         wave_mass = f"{name}wave mass", of_waves(model, factor)
         if vibrating:
-            turning = model.held.turning() if rest else []
             yield _Family(
                 TORSION,
                 partial(waves.tangent, m=0),
                 waves.held(0),
                 wave_mass,
                 contains=_turns,
-                rigid=free[-1] + free[0],  # its space has the motion along e3 too
-                motions=[_turned(model, cells) for cells in turning],
+                rigid=count.get(-1, 0) + count.get(0, 0),  # its space has the motion along e3 too
+                motions=list(free.get(-1, ())),
             )
         for m in range(1, waves.largest + 1):
-            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=free.get(m, 0))
+            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=count.get(m, 0))
         return
 
     def free_of(system: FiniteElementSystem) -> int:
@@ -212,14 +211,6 @@ def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
     phi.setArray(vector)
     M.mult(phi, product)
     return np.asarray(vector / np.sqrt(phi.dot(product)))
-
-
-def _turned(model: MeridianModel, cells: NDArray[np.bool_]) -> Vector:
-    """The motion of one shell about the axis."""
-    rho = np.zeros(len(model.r0.x.array) // 2)
-    nodes = model.V.dofmap.list[cells]
-    rho[nodes] = model.r0.x.array[::2][nodes]
-    return np.column_stack([rho, rho, 0 * rho]).ravel()
 
 
 def _turns(coefficients: Vector) -> bool:

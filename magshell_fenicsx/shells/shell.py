@@ -205,7 +205,8 @@ class ShellModel(Thin):
                 mirrored_edges = factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges")
                 terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
-                on_planes[name] = Support.of(held_on(V, 1, midsurface.edges[name], components), f"{name} mirror edges")
+                on_edge = held_on(V, 1, midsurface.edges[name], components)
+                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", in_plane=True)
                 continue
             edge, turn = "", None
             if name in clamped:

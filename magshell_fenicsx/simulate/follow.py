@@ -52,7 +52,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     except Stopped:
         yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0), scene=scene, shown=scene.displacement)
         raise
-    pivots = 0 if scene.loose else scene.newton.factor_at(state).negative_pivots
+    pivots = 0 if scene.loose or scene.free_in_time else scene.newton.factor_at(state).negative_pivots
     start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
     clock = dict[str, float]()
     if steps and (first_motion := steps[0].load.motion) and not own:

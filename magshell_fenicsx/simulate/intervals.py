@@ -203,7 +203,8 @@ class Intervals:
             error = self._rehearsal.error(scene, row, now.u if end == ends[row] else None)
         state = scene.model.system.placed(State(now.u, now.mu))
         stage = staged(scene, state, self.held)
-        pivots = stage.newton.factor_at(stage.enter(state)).negative_pivots
+        # rigid motions that are free have no stiffness: the sign of their pivots is rounding
+        pivots = 0 if scene.free_in_time else stage.newton.factor_at(stage.enter(state)).negative_pivots
         still = 0.0 * now.a
         habit = scene.newton.factorisation.habit
         point = Point(state, now.t, now.v, dt, pivots, pivots, *spent, error=error, habit=habit)

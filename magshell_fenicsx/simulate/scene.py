@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
+NOT_COUNTED = "boundary: the shell moves freely: its unstable directions are not counted"
 
 
 def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
@@ -135,6 +136,8 @@ class Scene:
         What is unphysical, or may be too large.
     loose
         Whether rigid motions may be left free: see `Problem.at_rest`.
+    free_in_time
+        Whether rigid motions are left free in a motion: see `Problem.moves_freely`.
     setup_s
         Time to build the scene in seconds, without compiling kernels.
     """
@@ -158,8 +161,12 @@ class Scene:
         several = surface is not None and surface.read  # a file may have pieces, of which each must be held
         unsure = self.model.axisymmetric or several or not self.problem.fixed
         self.loose = unsure and self.problem.at_rest
-        if unsure and not self.loose and (motion := self.model.free_motion(self.unloaded().mu)):
+        motion = self.model.free_motion(self.unloaded().mu) if unsure and not self.loose else ""
+        if motion and not self.problem.moves_freely:
             raise MeshError(motion)
+        self.free_in_time = bool(motion)
+        if motion:
+            self.warnings.append(NOT_COUNTED)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
         faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}

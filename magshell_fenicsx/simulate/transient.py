@@ -316,7 +316,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             "work": size * now.work,
             "imbalance": size * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
         }
-        excluded = scene.model.excluded_modes
+        excluded = None if scene.free_in_time else scene.model.excluded_modes
         unseen = sum(excluded.counts(point.state)) if excluded else 0
         rest = load.until == "rest" and kinetic <= QUIET * most and _rest(scene, held, point.state)
         if load.until == "instability" and point.negative_pivots + unseen:

@@ -34,7 +34,7 @@ from magshell_fenicsx.studies.identify_data import (
 )
 from magshell_fenicsx.studies.identify_field import NAME, field_of, flux_density
 from magshell_fenicsx.studies.identify_picture import draw_identified
-from magshell_fenicsx.studies.identify_predicted import Predictor
+from magshell_fenicsx.studies.identify_predicted import Predictor, varied
 from magshell_fenicsx.studies.identify_programmes import Programme, programme
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
@@ -122,6 +122,7 @@ def identify(
         names = Names(case)
         others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
         _refuse_few(table, parameters)
+        _refuse_priors(wider, parameters, made)
         programmes = [
             programme(name, wider, parameters, each, made, with_field=field is not None)
             for name, each in section.predict.items()
@@ -169,6 +170,23 @@ def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
         count = int((table.column == number).sum())
         if np.isnan(column.noise) and count <= len(bare):
             raise _no_noise(table, number, len(bare))
+
+
+def _refuse_priors(source: Source, parameters: Sequence[Parameter], made: Made) -> None:
+    """See that a case may have the mean of each prior: its keys have bounds, and so have parameters.
+
+    Raises
+    ------
+    CaseError
+        With the key of the prior, and what the case says.
+    """
+    for each in parameters:
+        if np.isinf(each.deviation):
+            continue
+        try:
+            made(varied(source, [each.number], np.array([each.mean])))
+        except CaseError as e:
+            raise CaseError(f"identify.parameters.{each.key}.prior: {e}") from None
 
 
 def _no_noise(table: Table, column: int, parameters: int) -> CaseError:
@@ -309,6 +327,7 @@ def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
         "noise": noise,
         "places": table.places,
         "shape": dict(table.shape),
+        "missing": dict(table.missing),
         "misfit_over_noise": float(np.sqrt(np.mean(((measured.data - fit.y) / s) ** 2))),
         "steps": fit.steps,
         "ended": fit.ended,

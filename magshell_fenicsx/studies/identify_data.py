@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.input.tables import TableError, column_size, read_table
+from magshell_fenicsx.input.tables import GREATEST, TableError, TableRows, column_size, read_rows
 from magshell_fenicsx.platform.reading import Files
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
@@ -89,6 +89,8 @@ class Table:
         The column of the places; "" without.
     shape
         Name of a place of the shape -> where it is on the undeformed shell, in the unit of its displacements.
+    missing
+        Name of a column -> in how many rows it has no number.
     """
 
     columns: tuple[Column, ...]
@@ -97,6 +99,7 @@ class Table:
     column: NDArray[np.int64]
     places: str
     shape: Mapping[str, list[float]] = field(default_factory=dict)
+    missing: Mapping[str, int] = field(default_factory=dict)
 
 
 class Names:
@@ -200,6 +203,20 @@ def _text(amount: Amount) -> str:
     return amount if isinstance(amount, str) else f"{amount:g}"
 
 
+def refuse_size(deviation: float, given: Amount, where: str) -> None:
+    """See that a standard deviation is one, whose square is a number.
+
+    Raises
+    ------
+    CaseError
+        If it is not positive, or out of bounds.
+    """
+    if not deviation > 0:
+        raise CaseError(f"{where}: must be positive, here {_text(given)}")
+    if not 1 / GREATEST <= deviation <= GREATEST:
+        raise CaseError(f"{where}: {_text(given)}: allowed are numbers from {1 / GREATEST:g} to {GREATEST:g}")
+
+
 def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple[Parameter, ...]:
     """The numbers that are looked for.
 
@@ -217,8 +234,8 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
             mean, deviation = (_in_unit_of(unit, amount, key) for amount in (given.prior, given.deviation))
         except CaseError as e:
             raise CaseError(f"{where}: {e}") from None
-        if given.deviation is not None and not deviation > 0:
-            raise CaseError(f"{where}.deviation: must be positive, here {_text(given.deviation)}")
+        if given.deviation is not None:
+            refuse_size(deviation, given.deviation, f"{where}.deviation")
         prior = (mean, deviation) if given.prior is not None else (start, np.inf)
         parameters.append(Parameter(Number(key, np.array([start]), (0.0, 1.0), unit), *prior))
     return tuple(parameters)
@@ -255,15 +272,16 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     CaseError
         If there are places without displacements, or these without places.
     """
-    columns, units = _columns(file)
+    table = _rows_of(file)
+    columns, units = table.columns, table.units
     where, there = f"--data {file}", [name for name in SHAPE if name in columns]
     if not there:
         return source, [], {}
     if len(there) < len(SHAPE) or not any(name in columns for name in MOVED):
         raise CaseError(f"{where}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} one or more")
     rows: list[list[float]] = [list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])]
-    if not np.isfinite(rows).all():
-        raise CaseError(f"{where}: {', '.join(SHAPE)}: has a row without a number")
+    for axis in SHAPE:
+        _refuse_missing(axis, columns[axis], table.lines, where)
     chosen = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {chosen[tuple(row)]: row for row in rows}
     texts = {
@@ -275,11 +293,34 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     return varied, [chosen[tuple(row)] for row in rows], shape
 
 
-def _columns(file: Path) -> tuple[dict[str, Array], dict[str, str | None]]:
+def _rows_of(file: Path) -> TableRows:
     try:
-        return read_table(file, Files())
+        return read_rows(file, Files())
     except TableError as e:
         raise CaseError(f"--data {file}: {e}") from None
+
+
+def _refuse_missing(name: str, values: Array, lines: Sequence[int], where: str) -> None:
+    """See that a column that says what a row is of has a number in each."""
+    for row in np.flatnonzero(np.isnan(values))[:1]:
+        raise CaseError(f"{where}: line {lines[row]}: {name}: has a row without a number")
+
+
+def refuse_twice(header: str, of: str, before: Mapping[str, str], where: str) -> None:
+    """See that a column is of another result, or key, than those before it: headers by these.
+
+    Raises
+    ------
+    CaseError
+        With both headers.
+    """
+    alike = next((name for name in before if name == of or _one_fold(name, of)), None)
+    if alike is not None:
+        raise CaseError(f"{where}: {before[alike]} and {header} are one measurement in two columns: leave one out")
+
+
+def _one_fold(of: str, other: str) -> bool:
+    return of in FOLDS and FOLDS[of] == FOLDS.get(other)
 
 
 def table_of(
@@ -296,8 +337,9 @@ def table_of(
     CaseError
         If a column is no result, has no unit, or the section names one that is not there.
     """
-    columns, units = _columns(file)
-    names, where = Names(case), f"--data {file}"
+    rows_of_file = _rows_of(file)
+    columns, units = rows_of_file.columns, rows_of_file.units
+    names, where, taken = Names(case), f"--data {file}", dict[str, str]()
     at: Array = np.full(0, np.nan)
     keys, results = dict[str, tuple[str, Array]](), list[tuple[Column, Array]]()
     places = length = ""
@@ -305,21 +347,26 @@ def table_of(
         parts = HEADER.fullmatch(header)
         name, unit = (parts[1], parts[2] or units[header]) if parts else (header, None)
         if "." in name:
-            keys[name] = (unit or "", values)
+            refuse_twice(header, name, taken, where)
+            _refuse_missing(header, values, rows_of_file.lines, where)
+            keys[name], taken[name] = (unit or "", values), header
             continue
         if rows and name in SHAPE:
             continue
         moved = bool(rows) and name in MOVED
         of, own, factor = names.of(f"{rows[0]}_{name}" if moved else name, unit, where)
+        refuse_twice(header, of, taken, where)
+        taken[of] = header
         if names.places and of == names.places.column:
+            _refuse_missing(header, values, rows_of_file.lines, where)
             at, places = values * factor, of
             continue
         noise = section.noise.get(name, section.noise.get(of))
         deviation = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
         of = of.removeprefix(rows[0]) if moved else of
         length = own if moved else length
-        if noise is not None and not deviation > 0:
-            raise CaseError(f"identify.noise.{name}: must be positive, here {_text(noise)}")
+        if noise is not None:
+            refuse_size(deviation, noise, f"identify.noise.{name}")
         results.append((Column(name, of, own, deviation), values * factor))
     if not results:
         raise CaseError(f"{where}: has no column with a result of this case")
@@ -347,7 +394,7 @@ def _listed(
     where: str,
     points: Sequence[str],
 ) -> Table:
-    """Rows as readings, those of the same settings together; what is no number was not measured."""
+    """Rows as readings, those of the same settings together; an empty cell was not measured."""
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column = dict[tuple[str, ...], list[int]]()
     for row in range(len(results[0][1])):
@@ -366,10 +413,10 @@ def _listed(
     flat = np.array([value for each in data.values() for value in each])
     if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
         raise CaseError(f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite")
-    if places and np.isnan(at).any():
-        raise CaseError(f"{where}: {places}: has a row without a number")
     numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
-    return Table(tuple(own for own, _ in results), readings, flat, numbers, places)
+    empty = {own.header: int(np.isnan(values).sum()) for own, values in results}
+    missing = {header: count for header, count in empty.items() if count}
+    return Table(tuple(own for own, _ in results), readings, flat, numbers, places, missing=missing)
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:
@@ -399,8 +446,7 @@ def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Readin
     """
     of, unit, _ = names.of(section.of, None, f"{key}.of")
     noise = names.amount(section.noise, of, f"{key}.noise")
-    if not noise > 0:
-        raise CaseError(f"{key}.noise: must be positive, here {_text(section.noise)}")
+    refuse_size(noise, section.noise, f"{key}.noise")
     if section.at is None:
         return Reading(of), unit, noise
     if names.places is None:

@@ -16,13 +16,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
-from magshell_fenicsx.input.tables import TableError, column_size, read_table
+from magshell_fenicsx.input.tables import TableError, column_size, read_rows
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, Row, write_csv
 from magshell_fenicsx.platform.reading import Files
 from magshell_fenicsx.problem.columns import extra_columns, sizes_in_units
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.runs.running import run
-from magshell_fenicsx.studies.identify_data import Parameter, parameters_of
+from magshell_fenicsx.studies.identify_data import Parameter, parameters_of, refuse_twice
 from magshell_fenicsx.studies.identify_drawn import NORMAL, band_of, drawn
 from magshell_fenicsx.studies.identify_field import without_room
 from magshell_fenicsx.studies.identify_picture import draw_programme
@@ -401,16 +401,20 @@ class _Names:
 def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Array, NDArray[np.int64], list[Column]]:
     """The place, what it is in each row, the rows' steps, and the columns."""
     try:
-        columns, units = read_table(file, Files())
+        rows = read_rows(file, Files())
     except TableError as e:
         raise CaseError(f"{where}: {file.name}: {e}") from None
-    where = f"{where}: {file.name}"
+    columns, units, where = rows.columns, rows.units, f"{where}: {file.name}"
     given = {header: values for header, values in columns.items() if header != "step"}
     if len(given) < 2:
         raise CaseError(f"{where}: needs two columns or more: the place first, then what was measured there")
     measured = [(header, *names.of(header, units[header], where), values) for header, values in given.items()]
+    taken = dict[str, str]()
+    for header, of, _, _ in measured:
+        refuse_twice(header, of, taken, where)
+        taken[of] = header
     (_, place, factor, at), *others = measured
     steps = np.asarray(columns.get("step", np.full(at.size, last)))
-    if not (np.isfinite(at).all() and at.size and np.isin(steps, np.arange(1, last + 1)).all()):
-        raise CaseError(f"{where}: a row has no place, or no step of 1 to {last}")
+    for row in np.flatnonzero(np.isnan(at) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
+        raise CaseError(f"{where}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}")
     return place, at * factor, steps.astype(np.int64), [Column(h, of, v * f, change=False) for h, of, f, v in others]

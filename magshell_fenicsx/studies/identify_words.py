@@ -31,6 +31,8 @@ def sentences(content: dict[str, Any], fit: Fit, table: Table) -> list[str]:
     for header, each in content["noise"].items():
         how = "estimated" if each["estimated"] else "given"
         said.append(f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}")
+    for header, count in table.missing.items():
+        said.append(f"{header}: rows without a number, left out: {count}")
     if not np.isnan(measured.noise).any():
         square = float((((measured.data - fit.y) / fit.noise[table.column]) ** 2).sum())
         if scipy.stats.chi2.sf(square, max(len(measured.data), 1)) < UNLIKELY:

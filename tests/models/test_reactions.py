@@ -7,6 +7,7 @@ from models.moving_scenes import CLAMPED, NONE, PLATE, RING, move, moving_scene
 import magshell_fenicsx as ms
 from magshell_fenicsx import Scene
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Move
 from magshell_fenicsx.parts.supports.reactions import Reaction, reactions
 
@@ -117,3 +118,32 @@ def test_half_and_whole() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9 * np.abs(b).max())
     total = sum((r.force for r in each[0].values()), NONE)
     np.testing.assert_allclose(total, [0, 0, -100.0 * 0.1 / PLATE["youngs_modulus"]], atol=1e-15)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("order", [("bottom", "top", "left", "right"), ("left", "right", "bottom", "top")])
+def test_edges_that_meet_share_a_corner(order: tuple[str, ...]) -> None:
+    """A square plate, hinged all around, under a pressure: by symmetry a quarter on each edge, in any order."""
+    case = {
+        "shell": {
+            "geometry": "plate",
+            "length": 1,
+            "width": 1,
+            "thickness": 0.01,
+            "youngs_modulus": 1.0,
+            "poisson_ratio": 0.3,
+        },
+        "boundary": dict.fromkeys(order, "hinged"),
+        "loading": {
+            "kind": "dead",
+            "loads": [{"over": "all", "pressure": 1e-9}],
+            "factor": 0.001,
+            "control": "load",
+            "points": 1,
+        },
+        "reactions": True,
+        "mesh": {"size": 0.5, "degree": 3},
+    }
+    scene = Scene(ms.Case.from_source(Source("test", {**case, "symmetry": "none"})))
+    *_, last = ms.follow(scene)
+    forces = np.array([found(scene, last.point.state)[name].force[2] for name in order])
+    assert forces / forces.sum() == pytest.approx([0.25] * 4, rel=1e-6)

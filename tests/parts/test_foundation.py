@@ -13,9 +13,11 @@ from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.mirror import Y0
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.shells.modes import ShellModes
 
-DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
+DISC: dict[str, Any] = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-3, "points": 1}
 
 
@@ -238,3 +240,33 @@ def test_springs_of_negative_stiffness() -> None:
     case = load(shell=DISC, boundary={"rim": "clamped"}, foundation={"tangential": 1, "factor": "x"}, loading=PRESSED)
     with pytest.raises(ms.CaseError, match=r"foundation\.factor: .x.: is -"):
         make_problem(case)
+
+
+FREE_DISC = {"shell": DISC, "boundary": {"rim": "free"}}
+
+
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "none"])
+def test_a_free_disc_on_springs(symmetry: str) -> None:
+    """It is held by its springs alone, in equilibrium with a force: their reaction is the force."""
+    force = {"kind": "indentation", "at": {"polar": 0}, "control": "load", "until": "target", "force": 1e-3}
+    springs = {"stiffness": 1e-3, "tangential": 1e-3}
+    case = load(**FREE_DISC, foundation=springs, loading={**force, "points": 1}, symmetry=symmetry)
+    assert "Winkler foundation" in describe(case)
+    assert end(case)["foundation_force"] == pytest.approx(1e-3, rel=1e-6)
+
+
+def test_a_free_disc_on_springs_swings_as_a_rigid_body() -> None:
+    """Springs of k and k_t per area: omega^2 rho h is k_t along and around the disc, k across it and tilting."""
+    R_over_h = DISC["radius_to_thickness"]
+    springs = {"stiffness": 1e-4 / R_over_h, "tangential": 3e-4 / R_over_h}  # over E/R
+    scene = ms.Scene(load(**FREE_DISC, foundation=springs, frequencies={}, symmetry="axisymmetric"))
+    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 4, loose=scene.loose)
+    assert sorted(mode.label for mode in modes) == ["", "m = 1", "m = 1", "torsion"]
+    expected = {("", 1e-4), ("m = 1", 1e-4), ("m = 1", 3e-4), ("torsion", 3e-4)}
+    assert {(mode.label, round(mode.eigenvalue, 7)) for mode in modes} == expected
+
+
+def test_springs_along_the_normal_leave_a_disc_free_across() -> None:
+    case = load(**FREE_DISC, foundation={"stiffness": 1e-3}, loading=PRESSED, symmetry="axisymmetric")
+    with pytest.raises(MeshError, match=r"free to move along \(1, 0, 0\)"):
+        ms.Scene(case)

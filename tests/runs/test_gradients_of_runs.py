@@ -93,6 +93,25 @@ def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
     assert not (tmp_path / "out/path.csv").exists()
 
 
+def test_one_key_without_a_gradient(tmp_path: Path) -> None:
+    """A remanence across the mirror plane breaks the symmetry of the half that is modelled: that key
+    is named, and the others have what they have without it."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    coarse, found = "--set=mesh.refinement=0.5", dict[str, dict[str, Any]]()
+    for out, by in (
+        ("all", "[thickness, magnetic.remanent.azimuth, shell.poisson_ratio]"),
+        ("some", "[thickness, shell.poisson_ratio]"),
+    ):
+        asked = f"--set=gradients={{of: [tip_uz], by: {by}}}"
+        done = magshell("run", tmp_path / "strip.yaml", coarse, asked, "--out", tmp_path / out, ranks=1)
+        assert done.returncode == 0, done.stderr
+        said = "warning: no gradient of tip_uz by magnetic.remanent.azimuth: "
+        assert (said in done.stdout) == (out == "all")
+        found[out] = summary(tmp_path / out)["gradients"]["tip_uz"]
+    assert set(found["some"]["numbers"]) == {"shell.poisson_ratio"}
+    assert found["all"] == found["some"]
+
+
 IN_UNITS = (
     CAP
     + """

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.input.tables import read_rows
+from magshell_fenicsx.platform.reading import Files
 from magshell_fenicsx.simulate.readings import Reading, read
 from magshell_fenicsx.studies.laplace import Measured, fitted
 
@@ -27,6 +29,16 @@ identify:
     - {of: tip_uz_mm, at: 1 mT, noise: 0.05 mm}
 """
 COARSE = STRIP.replace("degree: 3, refinement: 0.5", "degree: 2, refinement: 0.3")
+AT = "applied [mT],tip_uz [mm]\n"
+SLIPS = {  # rows below that header -> what is said; lines are those of the file
+    "5,9\n\n10,abc\n": r"measured.csv: line 4: tip_uz \[mm\]: abc: is no number",
+    "5,9\nnan,12\n": "line 3: applied: has a row without a number",
+    "5,9\n10,1e300\n": r"line 3: tip_uz: 1e\+300: allowed are numbers up to 1e\+30",
+    "5,9\n10,inf\n": "line 3: tip_uz: inf: allowed are numbers up to",
+    "5,9\n10\n": "has 2 names in its header and 1 columns in line 3",
+    "5,9\n10,1,2\n": "has 2 names in its header and 3 columns in line 3",
+    "": "has no rows of numbers below a header with the names of its columns",
+}
 KEYS = ("shell.youngs_modulus", "magnetic.remanent.polar")
 TRUTH = np.array([900.0, 80.0])  # kPa, degrees
 FIELDS = (3.0, 7.0, 11.0, 15.0, 19.0)  # mT
@@ -264,6 +276,28 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
             [],
             "shell.youngs_modulus: is a column of the data, so it is known",
         ),
+        *[(f"{AT}{rows}", [], said) for rows, said in SLIPS.items()],
+        ("applied [mT],tip_uz [mm],tip_uz [um]\n5,9,9000\n", [], "has a column twice: applied"),
+        (
+            "applied [mT],tip_uz [mm],tip_uz_mm\n5,9,9\n",
+            [],
+            "tip_uz and tip_uz_mm are one measurement in two columns: leave one out",
+        ),
+        (
+            "applied [mT],applied_mT,tip_uz [mm]\n5,5,9\n",
+            [],
+            "applied and applied_mT are one measurement in two columns",
+        ),
+        (
+            f"{AT}5,9\n",
+            ["identify.parameters={shell.youngs_modulus: {prior: -1 kPa, deviation: 1 kPa}}"],
+            "youngs_modulus.prior: .*'-1 kPa': must be greater than or equal to 1",
+        ),
+        (
+            f"{AT}5,9\n",
+            ["identify.noise={tip_uz: 1e-300 mm}"],
+            "identify.noise.tip_uz: 1e-300 mm: allowed are numbers from 1e-30 to 1e",
+        ),
     ],
 )
 def test_what_identifies_nothing(tmp_path: Path, data: str, settings: list[str], said: str) -> None:
@@ -290,6 +324,33 @@ def test_check_looks_at_the_section(tmp_path: Path, setting: str, said: str) -> 
     done = magshell("check", case_file(tmp_path), "--set", setting)
     assert done.returncode == (2 if said else 0)
     assert said in done.stderr
+
+
+def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
+    """Quotes, semicolons, comments, blank rows and empty cells: the numbers of the plain table, and
+    each with the line of the file in which it is."""
+    plain = read_rows(data_file(tmp_path, f"{AT}5,9\n10,\n"), Files())
+    text = '# Monday\n\n"applied [mT]";"tip_uz [mm]"\n;\n"5";"9" # first\n10;nan\n'
+    quoted = read_rows(data_file(tmp_path, text), Files())
+    assert quoted.units == plain.units == {"applied": "mT", "tip_uz": "mm"}
+    for name, column in plain.columns.items():
+        np.testing.assert_array_equal(quoted.columns[name], column)
+    assert (list(plain.lines), list(quoted.lines)) == ([2, 3], [5, 6])
+    above = read_rows(data_file(tmp_path, "# scan of Monday\n# x y [mm]\n1 2\n"), Files())
+    assert above.units == {"x": None, "y": "mm"}
+
+
+def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
+    """What is nan or empty is said in the output and in identify.json, by column; the band is that of
+    the table without these rows."""
+    case = case_file(tmp_path, COARSE + "identify: {parameters: {shell.youngs_modulus: {}}}\n")
+    found = dict[str, dict[str, Any]]()
+    for name, rows in {"some": "5,9\n8,nan\n10,12\n12,\n15,13\n", "all": "5,9\n10,12\n15,13\n"}.items():
+        found[name] = ms.identify(case, data_file(tmp_path, AT + rows), out=tmp_path / name).content
+    assert found["some"]["missing"] == {"tip_uz": 2}
+    assert "tip_uz: rows without a number, left out: 2" in found["some"]["said"]
+    assert found["all"]["missing"] == {}
+    assert found["some"]["parameters"] == found["all"]["parameters"]
 
 
 def test_one_datum_says_no_noise(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_bands_of_another_history(tmp_path: Path) -> None:
         ("identify.predict.turned.changes=[tip_uy]", "identify.predict.turned.changes: tip_uy: is no column that"),
         ("identify.predict.turned.data=none.csv", "identify.predict.turned.data: none.csv: cannot be read"),
         ("identify.predict.turned.data=no_unit.csv", "no_unit.csv: tip_uz: has no unit: write tip_uz"),
-        ("identify.predict.turned.data=step.csv", "step.csv: a row has no place, or no step of 1 to 1"),
+        ("identify.predict.turned.data=step.csv", "step.csv: line 2: a row has no place, or no step of 1 to 1"),
         ("identify.predict={a b: {of: [knockdown]}}", "a b: a name has letters, digits and _ alone"),
         ("identify.predict.turned={samples: 30}", "give data, of, or both: nothing is predicted"),
     ],

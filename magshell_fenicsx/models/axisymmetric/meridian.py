@@ -103,10 +103,6 @@ class Meridian:
             bodies = [of for of in bodies if all(of is not part for part in parts)] + [np.any(parts, axis=0)]
         return bodies
 
-    def by_body(self, facets: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-        """Those on each of `bodies`."""
-        return [facets[np.isin(self._at(facets), self._ends[of])] for of in self.bodies]
-
     @property
     def joints(self) -> list[Array | None]:
         """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a T-junction."""

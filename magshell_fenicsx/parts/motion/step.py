@@ -59,8 +59,9 @@ class TimeSection(Step):
     """Equal parts of the duration, each a row"""
     history: dict[str, History] = Field(default_factory=dict)
     """Load -> its values over the time of the step: `field` (over that of `magnetic`, or as a flux density), `pressure`
-    (over p_c, or as 400 Pa), or the amplitude of another step, as its target: a ramp, step, triangle or sine, a table
-    [[time, value], ...] with straight lines and jumps, or a formula of the time t without units"""
+    (over p_c, or as 400 Pa), `interaction` (its factor), or the amplitude of another step, as its target: a ramp, step,
+    triangle or sine, a table [[time, value], ...] with straight lines and jumps, or a formula of the time t without
+    units"""
     rho_inf: float = Field(default=0.8, ge=0, le=1)
     """Factor by which the highest frequencies fade at each step; 1 conserves energy"""
     step: Time | None = None
@@ -125,6 +126,11 @@ class TimeSection(Step):
     def rests(self) -> bool:
         return self.until == "rest"
 
+    @property
+    def needs_inertia_alone(self) -> bool:
+        """Whether neither an equilibrium nor a mode of the shell is asked for, so that it may be free."""
+        return self.until in ("duration", "event") and self.push is None and not self.hold
+
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         key, driven = step.key, context.driven_before(step.number)
         timed = {each.name: each for ability in context.abilities if (each := ability.in_time(context, driven))}
@@ -136,7 +142,8 @@ class TimeSection(Step):
                     f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
                 )
         loads = {each.name: each.load for each in context.steps}
-        allowed = {"field", "pressure", *loads} - {"lambda_m", "angle", "time"}
+        factors = _factors_of_sections(context)
+        allowed = {"field", "pressure", *factors, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
                 raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
@@ -168,6 +175,15 @@ class TimeSection(Step):
         for name, history in self.history.items():
             given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
         yield from ((key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str))
+
+
+def _factors_of_sections(context: Context) -> set[str]:
+    """Return the amplitudes of what sections ask for and no step drives, such as "interaction"."""
+    from magshell_fenicsx.parts.path_step import FactorStep
+    from magshell_fenicsx.parts.registered import FIRST, STEPS  # which has this step too
+
+    steps = [STEPS[kind] for kind in FIRST]
+    return {each.amplitude for each in steps if issubclass(each, FactorStep) and each.asked_for(context)}
 
 
 def level_in(context: Context, name: str, level: Level) -> float:

@@ -26,16 +26,26 @@ class Support:
         Name of the term that holds the normal of a clamped edge; "" without.
     turn
         The rotation in that term, if a motion turns the edge.
+    in_plane
+        Whether a mirror plane holds it, in the direction of its normal alone.
     """
 
     dofs: NDArray[np.int32]
     edge: str = ""
     turn: fem.Constant | None = None
+    in_plane: bool = False
 
     @classmethod
-    def of(cls, held: Iterable[fem.DirichletBC], edge: str = "", turn: fem.Constant | None = None) -> "Support":
+    def of(
+        cls,
+        held: Iterable[fem.DirichletBC],
+        edge: str = "",
+        turn: fem.Constant | None = None,
+        *,
+        in_plane: bool = False,
+    ) -> "Support":
         dofs = [bc.dof_indices()[0] for bc in held]
-        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn)
+        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, in_plane)
 
 
 def motions_of(loads: Loads, name: str) -> Sequence[Motion]:

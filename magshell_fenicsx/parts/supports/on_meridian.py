@@ -1,4 +1,4 @@
-"""What holds a meridian: displacements that are zero at its ends, and whether it is held against rigid motions."""
+"""What holds a meridian: displacements that are zero at its ends, and its rigid motions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,8 +11,9 @@ from magshell_fenicsx.mesh.mirror import STRAIGHT
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.parts.supports.supports import NOT_HELD, RIGHT, no_mirror
+from magshell_fenicsx.parts.supports.supports import RIGHT, no_mirror
 
+Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
 
@@ -49,42 +50,40 @@ class Supports:
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
 
-    def rigid_motions(self, r0: fem.Function) -> dict[int, int]:
-        """The number of rigid motions that no support stops of m = 0 and 1: along and around e3, across and about e1.
+    def held_unknowns(self, r0: fem.Function, wave: int) -> NDArray[np.int32]:
+        """Return the unknowns of a family of `rigid_motions` that are zero at the axis and at the supports.
 
-        Of m = 0 the motion along e3 is 1, that around it is counted under -1. Each of m = 1 has a twin.
+        The nodes of the spaces of displacements and of waves have the same numbers.
         """
-        free = {0: 0, -1: len(self.turning()), 1: 0}
-        for horizontal, axial in self._by_body():
-            # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
-            rows = [[1.0, z] for _, z in self._places(r0, horizontal)]
-            rows += [[0.0, rho] for rho, _ in self._places(r0, axial)]
-            free[0] += not len(axial)
-            free[1] += 2 - int(np.linalg.matrix_rank(np.array(rows), tol=1e-9) if rows else 0)
-        return free
+        axis, horizontal, axial = (
+            fem.locate_dofs_topological(r0.function_space, 0, facets)
+            for facets in (self.axis, self.horizontal, self.axial)
+        )
+        if wave == 0:
+            return np.concatenate([2 * axis, 2 * horizontal, 2 * axial + 1])
+        at_axis = [3 * axis + i for i in ((0, 2) if wave == 1 else (0, 1, 2))]
+        return np.concatenate([*at_axis, 3 * horizontal, 3 * horizontal + 1, 3 * axial + 2])
 
-    def turning(self) -> list[NDArray[np.bool_]]:
-        """The cells of each shell, or of those joined, that no support keeps from turning about e3."""
-        bodies = zip(self.meridian.bodies, self._by_body(), strict=True)
-        return [cells for cells, (horizontal, _) in bodies if not len(horizontal)]
+    def rigid_motions(self, r0: fem.Function) -> dict[int, Array]:
+        """Return the rigid motions of each shell, or of those joined, whatever holds them.
 
-    def free_motion(self, r0: fem.Function) -> str:
-        """A rigid motion that is left free, as a message; empty if there is none. Nothing but supports holds it."""
-        free = self.rigid_motions(r0)
-        if free[0]:
-            return NOT_HELD + "move along (0, 0, 1)"
-        if free[1]:
-            return NOT_HELD + ("move along (1, 0, 0)" if self.turning() else "turn")
-        return ""
-
-    def _by_body(self) -> list[tuple[Facets, Facets]]:
-        """Where the displacements of each of these normal to e3 and along e3 are zero."""
-        return list(zip(*map(self.meridian.by_body, (self.horizontal, self.axial)), strict=True))
-
-    @staticmethod
-    def _places(r0: fem.Function, facets: Facets) -> NDArray[np.float64]:
-        dofs = fem.locate_dofs_topological(r0.function_space, 0, facets)
-        return np.asarray(r0.x.array.reshape(-1, 2)[dofs])
+        Returns
+        -------
+        dict
+            Of m = 0 the displacements (bodies, nodes times 2) along e3; of -1 the waves m = 0 around it, and of 1 those
+            across it and about an axis across it, as coefficients (U + V, V, W), (n, nodes times 3).
+        """
+        along, around, across = list[Array](), list[Array](), list[Array]()
+        places = r0.x.array.reshape(-1, 2)
+        for cells in self.meridian.bodies:
+            rho, z, one = np.zeros((3, len(places)))
+            nodes = r0.function_space.dofmap.list[cells]
+            one[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
+            zero = 0.0 * one
+            along.append(np.column_stack([zero, one]).ravel())
+            around.append(np.column_stack([rho, rho, zero]).ravel())
+            across += [np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])]
+        return {0: np.array(along), -1: np.array(around), 1: np.array(across)}
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:

@@ -46,8 +46,9 @@ class Reaction:
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """The reactions of all supports in the model's frame; collective.
 
-    A node of two supports belongs to the first. A clamped edge also makes a couple: its energy is invariant if shell
-    and edge turn together, so the couple is minus the moment of that energy's gradient.
+    Supports that hold a node together share its force equally. A clamped edge also makes a couple:
+    its energy is invariant if shell and edge turn together, so the couple is minus the moment of that
+    energy's gradient.
 
     Parameters
     ----------
@@ -55,17 +56,15 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
         Of a half model or a sector: the reactions are those of the whole shell.
     """
     system, comm = model.system, model.system.comm
-    R, taken = system.forces(state.u, state.mu), np.zeros(system.size, dtype=bool)
+    R, shares = system.forces(state.u, state.mu), _shares(model)
     axes = system.u.function_space.dofmap.index_map_bs
     r = in_space(model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes)
     by_support: dict[str, Reaction] = {}
     for name, support in model.supports.items():
         dofs = support.dofs[support.dofs < system.size]
         box = _box(r[np.unique(dofs // axes)], mirror if mirror and mirror.other(name) == name else None, comm)
-        point, held = box.mean(axis=0), np.zeros(system.size)
-        dofs = dofs[~taken[dofs]]
-        held[dofs], taken[dofs] = R[dofs], True
-        F, arm = in_space(held, axes), r - point
+        point = box.mean(axis=0)
+        F, arm = in_space(shares[name] * R, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
         if support.edge:
             M = M - np.cross(arm, in_space(system.forces(state.u, state.mu, support.edge), axes)).sum(axis=0)
@@ -79,23 +78,32 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
 def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
     """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a way (3,).
 
-    As in `reactions`, of the whole shell, and a node of two supports belongs to the first.
+    As in `reactions`, of the whole shell, and supports that hold a node together share its force equally.
     """
-    system, weights = model.system, np.zeros(model.system.size)
     if mirror and name in mirror.lost:
         name, way = mirror.lost[name], mirror.reflection @ way
     elif mirror and mirror.other(name) == name:
         way = mirror.summed(way)
-    taken = np.zeros(system.size, dtype=bool)
-    for other, support in model.supports.items():
-        dofs = support.dofs[support.dofs < system.size]
-        if other == name:
-            axes = system.u.function_space.dofmap.index_map_bs
-            along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
-            weights[dofs] = np.where(taken[dofs], 0.0, along[dofs % axes])
-            return weights
-        taken[dofs] = True
-    raise KeyError(name)
+    system = model.system
+    axes = system.u.function_space.dofmap.index_map_bs
+    along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
+    return _shares(model)[name] * np.tile(along, system.size // axes)
+
+
+def _shares(model: "Observed") -> dict[str, Array]:
+    """Return the share that each support has in the force at the owned unknowns.
+
+    Edges and points that hold an unknown share it equally. What they hold at a mirror plane is not the plane's.
+    """
+    size = model.system.size
+    held = {name: np.zeros(size) for name in model.supports}
+    for name, support in model.supports.items():
+        held[name][support.dofs[support.dofs < size]] = 1.0
+    planes = [name for name, support in model.supports.items() if support.in_plane]
+    supported = sum((each for name, each in held.items() if name not in planes), np.zeros(size))
+    for name in planes:
+        held[name][supported > 0] = 0.0
+    return {name: each / np.maximum(sum(held.values(), np.zeros(size)), 1.0) for name, each in held.items()}
 
 
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:

@@ -3,7 +3,7 @@
 Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface alone.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import basix
 import numpy as np
@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.connected import pieces
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
-from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
+from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, symmetric_part
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.mirror import STRAIGHT, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
@@ -220,20 +220,41 @@ def _loose(
     for i, axis in enumerate(np.eye(3)):
         motions[i, :, i] = own
         motions[3 + i] = np.cross(axis, x - centre) * own[:, None]
-    rigid = motions.reshape(6, -1)
-    stopped = rigid - np.array([system.held(v) for v in rigid])
-    _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
-    free = vectors[values < FREE * max(values.max(), 1.0)] @ rigid
+    return unresisted(
+        motions.reshape(6, -1), system.held, lambda: system.tangent(np.zeros(system.size), amplitudes), system.comm
+    )
+
+
+def unresisted(rigid: Array, held: Callable[[Vector], Vector], tangent: Callable[[], Tangent], comm: MPI.Comm) -> Array:
+    """Return the rigid motions that neither a support nor the shell's energy resists; collective.
+
+    Parameters
+    ----------
+    rigid
+        Rigid motions (k, unknowns of this rank) of the undeformed shell.
+    held
+        Puts zeros into a displacement where the shell is held.
+    tangent
+        Makes the tangent of the undeformed shell. It is not called where supports stop all motions.
+
+    Returns
+    -------
+    Array
+        (n, unknowns) combinations of length one, n at most k, the one of the lowest energy first.
+    """
+    stopped = rigid - np.array([held(motion) for motion in rigid])
+    _, squares, combinations = np.linalg.svd(comm.allreduce(stopped @ stopped.T))
+    free = combinations[squares < FREE * max(squares.max(), 1.0)] @ rigid
     if not len(free):
         return np.asarray(free)
-    free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
-    K = symmetric_part(system.tangent(np.zeros(system.size), amplitudes))
-    out, energies = K.createVecLeft(), []
-    for v in free:
-        given = K.createVecRight()
-        given.array[:] = v
-        K.mult(given, out)
-        energies.append(system.comm.allreduce(free @ out.array))
+    free /= np.sqrt(comm.allreduce((free**2).sum(axis=1)))[:, None]
+    K = symmetric_part(tangent())
+    product, energies = K.createVecLeft(), []
+    for motion in free:
+        displacement = K.createVecRight()
+        displacement.array[:] = motion
+        K.mult(displacement, product)
+        energies.append(comm.allreduce(free @ product.array))
     values, vectors = np.linalg.eigh(np.array(energies))
     return np.asarray(vectors.T[values < LOOSE * K.norm(PETSc.NormType.INFINITY)] @ free)
 
@@ -262,7 +283,7 @@ def supports(
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
-            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL))
+            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), in_plane=True)
             continue
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
