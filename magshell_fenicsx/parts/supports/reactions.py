@@ -87,7 +87,7 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
     system = model.system
     axes = system.u.function_space.dofmap.index_map_bs
     along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
-    return _shares(model)[name] * np.tile(along, system.size // axes)
+    return np.asarray(_shares(model)[name] * np.tile(along, system.size // axes))
 
 
 def _shares(model: "Observed") -> dict[str, Array]:
