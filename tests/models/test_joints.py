@@ -105,3 +105,11 @@ def test_messages() -> None:
         CaseError, match=r"stiffness belongs to kind: spring, and must be given there; the kind is hinge"
     ):
         deflected({"kind": "hinge", "stiffness": 1})
+
+
+def test_an_edge_joins_another_shell() -> None:
+    """An edge lies on its own shell always: that joint would join nothing."""
+    source = read_source(CASES / "stiffened_plate.yaml")
+    data = {**source.data, "joints": [{"edges": ["stiffener.bottom", "stiffener"]}]}
+    with pytest.raises(CaseError, match="stiffener: is the shell of the edge itself"):
+        ms.Case.from_source(Source("test", data))
