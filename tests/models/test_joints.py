@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import CaseError
@@ -109,7 +110,5 @@ def test_messages() -> None:
 
 def test_an_edge_joins_another_shell() -> None:
     """An edge lies on its own shell always: that joint would join nothing."""
-    source = read_source(CASES / "stiffened_plate.yaml")
-    data = {**source.data, "joints": [{"edges": ["stiffener.bottom", "stiffener"]}]}
     with pytest.raises(CaseError, match="stiffener: is the shell of the edge itself"):
-        ms.Case.from_source(Source("test", data))
+        Case.load(CASES / "stiffened_plate.yaml", ["joints=[{edges: [stiffener.bottom, stiffener]}]"])
