@@ -41,9 +41,8 @@ def describe(case: Case, problem: Problem | None = None) -> str:
 def _described(case: Case, problem: Problem) -> str:
     too_large = None if case.mesh.tolerance else refuse_beyond_memory(problem)
     unsupported = all(condition in ("free", "symmetry") for condition in problem.conditions.values())
-    if unsupported and not (
-        problem.at_rest or problem.moves_freely or problem.loads.own
-    ):  # springs may hold it: a run asks its tangent
+    springs_may_hold = bool(problem.loads.own)  # a run asks its tangent
+    if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
         "R/h": 1 / problem.material.h,

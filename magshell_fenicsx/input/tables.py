@@ -220,8 +220,8 @@ def _header(text: str) -> tuple[str, int]:
 
 
 def _mark(header: str) -> str | None:
-    """What separates columns; None: blanks."""
-    return next((mark for mark in (";", "	", ",") if mark in header), None)
+    """Return what separates columns; None for blanks."""
+    return next((mark for mark in (";", "\t", ",") if mark in header), None)
 
 
 def _names(header: str) -> list[str]:
@@ -243,7 +243,7 @@ def _rows(text: str, mark: str | None, begin: int) -> Iterator[tuple[int, list[s
 
 
 def _number(cell: str) -> float | None:
-    """That of a cell, nan of an empty one; None of text."""
+    """Return the number of a cell, nan of an empty one; None of text."""
     try:
         return float(cell) if cell else np.nan
     except ValueError:

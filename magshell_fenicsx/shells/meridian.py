@@ -18,7 +18,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Lid, Pressed
 from magshell_fenicsx.assembly.parameters import Growing, Parameter, Settable, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import on_meridian
@@ -33,7 +33,7 @@ from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells, side_of
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
-from magshell_fenicsx.parts.supports.on_meridian import supports
+from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin
@@ -300,37 +300,31 @@ class MeridianModel(Thin):
         """Coordinates (n, 1) of the nodes along the meridian."""
         return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
 
-    def rigid_motions(self, amplitudes: Amplitudes) -> dict[int, Array]:
+    def rigid_motions(self, amplitudes: Amplitudes) -> RigidMotions:
         """Return the rigid motions of the undeformed shell that neither supports nor springs resist.
 
-        Returns
-        -------
-        dict
-            As of `Supports.rigid_motions`: motions along e3 under 0, around it under -1, and under 1 those across
-            it, each of which has a twin.
+        Where supports leave waves free, it compiles their kernels.
         """
-        state, free = State(self.zero(), dict(amplitudes)), dict[int, Array]()
-        for wave, motions in self.held.rigid_motions(self.r0).items():
-            held = partial(_with_zeros, self.held.held_unknowns(self.r0, wave))
-            tangent = partial(self._tangent_of_wave, state, wave)
-            free[wave] = unresisted(motions, held, tangent, self.V.mesh.comm)
-        return free
+        state, comm = State(self.zero(), dict(amplitudes)), self.V.mesh.comm
+        motions = self.held.rigid_motions(self.r0)
+
+        def unresisted_waves(waves: Array, m: int) -> Array:
+            held = partial(_with_zeros, self.held.unknowns_of_waves(self.r0, m))
+            return unresisted(waves, held, lambda: self.waves.tangent(state, m), comm)
+
+        tangent = partial(self.system.tangent, state.u, state.mu)
+        along = unresisted(motions.along, self.system.held, tangent, comm)
+        return RigidMotions(along, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1))
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """Return a rigid motion that is left free, as a message; empty if there is none."""
         free = self.rigid_motions(amplitudes)
-        if len(free[0]):
+        if len(free.along):
             return NOT_HELD + "move along (0, 0, 1)"
-        if len(free[1]):
-            turns_alone = len(free[1]) == 1 and np.abs(free[1][0][2::3]).max() > SMALL_RISE
+        if len(free.across):
+            turns_alone = len(free.across) == 1 and np.abs(free.across[0][2::3]).max() > SMALL_RISE
             return NOT_HELD + ("turn" if turns_alone else "move along (1, 0, 0)")
         return ""
-
-    def _tangent_of_wave(self, state: State, wave: int) -> Tangent:
-        """Return the tangent of a family of `Supports.rigid_motions`; that of waves compiles kernels."""
-        if wave == 0:
-            return self.system.tangent(state.u, state.mu)
-        return self.waves.tangent(state, max(wave, 0))
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""

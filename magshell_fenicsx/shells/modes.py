@@ -177,9 +177,10 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
         )
 
     if isinstance(model, MeridianModel):
-        free = model.rigid_motions(rest.mu) if rest else {}
-        count = {wave: len(motions) for wave, motions in free.items()}
-        yield of("", model.system, count.get(0, 0))
+        free = model.rigid_motions(rest.mu) if rest else None
+        along, across = (len(free.along), len(free.across)) if free else (0, 0)
+        around: list[Vector] = [*free.around] if free else []
+        yield of("", model.system, along)
         waves = model.excluded_modes.waves
         wave_mass = f"{name}wave mass", of_waves(model, factor)
         if vibrating:
@@ -189,11 +190,12 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
                 waves.held(0),
                 wave_mass,
                 contains=_turns,
-                rigid=count.get(-1, 0) + count.get(0, 0),  # its space has the motion along e3 too
-                motions=list(free.get(-1, ())),
+                rigid=len(around) + along,  # its space has the motion along e3 too
+                motions=around,
             )
         for m in range(1, waves.largest + 1):
-            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=count.get(m, 0))
+            rigid = across if m == 1 else 0
+            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=rigid)
         return
 
     def free_of(system: FiniteElementSystem) -> int:

@@ -10,10 +10,10 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import (
-    EVEN,
-    OF_EVEN,
-    OPEN,
+    GAP_OPEN,
     PRESSURE,
+    RESOLVED,
+    RESOLVED_PRESSURE,
     Surface,
     resolved_pressure,
 )
@@ -60,8 +60,9 @@ def test_pressure_of_cells_pressed_in_part() -> None:
     def at_nodes(values: np.ndarray) -> np.ndarray:
         return np.array([values[0], *((values[1:] + values[:-1]) / 2), values[-1]])
 
-    fields = {PRESSURE: at_nodes(of_cells), EVEN: at_nodes(even), OF_EVEN: at_nodes(even * of_cells)}
-    fields[OPEN] = np.array([1, 0, 0, 1, 1, 1, 1.0])
+    fields = {PRESSURE: at_nodes(of_cells), RESOLVED: at_nodes(even)}
+    fields[RESOLVED_PRESSURE] = at_nodes(even * of_cells)
+    fields[GAP_OPEN] = np.array([1, 0, 0, 1, 1, 1, 1.0])
     found = resolved_pressure(cells, fields)
     assert found.keys() == {PRESSURE}
     assert found[PRESSURE] == pytest.approx([0, 1, 1, 0, 0, np.nan, np.nan], nan_ok=True)

@@ -22,20 +22,20 @@ LENGTH, DENSITY, REMANENCE, FIELD, ANGLE = 10e-3, 2000.0, 10e-3, 1e-3, 5.0  # SI
 MAGNET = {
     "shell": {
         "geometry": "plate",
-        "length": LENGTH,
-        "width": LENGTH,
-        "thickness": 1e-3,
-        "youngs_modulus": 1e8,
+        "length": f"{LENGTH} m",
+        "width": f"{LENGTH} m",
+        "thickness": "1 mm",
+        "youngs_modulus": "100 MPa",
         "poisson_ratio": 0.3,
-        "density": DENSITY,
+        "density": f"{DENSITY} kg/m^3",
     },
     "boundary": {"left": "free", "right": "free", "bottom": "free", "top": "free"},
-    "points": {"tip": [LENGTH, LENGTH / 2, 0]},
+    "points": {"tip": [f"{LENGTH} m", f"{LENGTH / 2} m", 0]},
     "magnetic": {
         "remanent": {"polar": 90, "azimuth": 0, "flux_density": f"{REMANENCE} T"},
         "applied": {"polar": 90 - ANGLE, "azimuth": 0, "flux_density": f"{FIELD} T"},
     },
-    "mesh": {"degree": 2, "size": LENGTH / 2},
+    "mesh": {"degree": 2, "size": f"{LENGTH / 2} m"},
 }
 SWING = {
     "kind": "time",
@@ -48,11 +48,7 @@ SWING = {
 
 
 def case_of(**sections: Any) -> Case:
-    units = {"length": "m", "width": "m", "thickness": "m", "youngs_modulus": "Pa", "density": "kg/m^3"}
-    shell = {k: f"{v} {units[k]}" if k in units else v for k, v in MAGNET["shell"].items()}
-    points = {name: [f"{x} m" for x in at] for name, at in MAGNET["points"].items()}
-    mesh = {**MAGNET["mesh"], "size": f"{MAGNET['mesh']['size']} m"}
-    return Case.from_source(Source("test", {**MAGNET, "shell": shell, "points": points, "mesh": mesh, **sections}))
+    return Case.from_source(Source("test", {**MAGNET, **sections}))
 
 
 def test_a_magnetised_plate_is_a_compass_needle() -> None:

@@ -20,16 +20,11 @@ from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import (
-    EVEN,
-    GAP,
-    NO_GAP,
-    OF_EVEN,
-    OPEN,
-    PRESSURE,
     SHELL,
     W0,
     Surface,
     SurfaceGatherer,
+    add_contact,
     grown,
     resolved_pressure,
 )
@@ -107,17 +102,8 @@ class RevolvedGatherer:
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
         values = tensors | principal_fields(components) | self._fields.of(swept.jets(self._model.u), state.mu)
-        pressure = self._model.cell_pressures(state) if state.mu else None
-        if pressure is not None:
-            even = self._model.cells_evenly_pressed(state).astype(np.float64)
-            values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
-            values[EVEN] = np.repeat(even[swept.order, None], 2, axis=1)
-            values[OF_EVEN] = values[PRESSURE] * values[EVEN]
-            values[OPEN] = np.where(values.get(GAP, np.zeros(values[EVEN].shape)) > NO_GAP, 1.0, 0.0)
-        gap = self._model.cell_gaps(state) if state.mu else None
-        if gap is not None:
-            of_shells = np.repeat(gap[swept.order, None] / self._model.material.h, 2, axis=1)
-            values[GAP] = np.minimum(values.get(GAP, np.inf), of_shells)
+        if state.mu:
+            add_contact(values, self._model, state, lambda of_cells: np.repeat(of_cells[swept.order, None], 2, axis=1))
         values |= rubber_fields(values, self._law)
         turned = self._around(values)
         fields = resolved_pressure(swept.cells, self._constant | turned)

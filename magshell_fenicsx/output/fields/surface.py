@@ -22,6 +22,7 @@ from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_
 from magshell_fenicsx.shape.solids import Solid
 
 if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
@@ -30,8 +31,8 @@ SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strain
 MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
 GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
 PRESSURE = "contact_pressure"  # of bodies and of parts of the shell, over E h/R; nan where cells are too wide
-EVEN, OF_EVEN, OPEN = "evenly_pressed", "pressure_of_even", "open"  # see `resolved_pressure`
-NO_GAP = 1e-2  # over h: of a node that touches
+RESOLVED, RESOLVED_PRESSURE, GAP_OPEN = "evenly_pressed", "pressure_of_even", "open"  # see `add_contact`
+LARGEST_CLOSED_GAP = 1e-2  # over h
 SHELL = "shell"  # the number of the shell, where there are several
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba", "J"}  # a half shell's fields may be symmetric or antisymmetric to its plane
@@ -170,17 +171,14 @@ class SurfaceGatherer:
             self._take_placement(state.mu)
         jet = self._jet(self._model.u, self._places, 1)
         values = self._fields.of(jet, state.mu)
-        pressure = self._model.cell_pressures(state) if state.mu else None
-        if pressure is not None:
-            even = self._model.cells_evenly_pressed(state).astype(np.float64)
-            values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
-            values[EVEN] = np.repeat(even[: self._owned, None], len(self._places), axis=1)
-            values[OF_EVEN] = values[PRESSURE] * values[EVEN]
-            values[OPEN] = np.where(values.get(GAP, np.zeros(values[EVEN].shape)) > NO_GAP, 1.0, 0.0)
-        gap = self._model.cell_gaps(state) if state.mu else None
-        if gap is not None:
-            gap = np.repeat(gap[: self._owned, None] / self._model.material.h, len(self._places), axis=1)
-            values[GAP] = np.minimum(values.get(GAP, np.inf), gap)
+        if state.mu:
+            nodes_of_cell = len(self._places)
+            add_contact(
+                values,
+                self._model,
+                state,
+                lambda of_cells: np.repeat(of_cells[: self._owned, None], nodes_of_cell, axis=1),
+            )
         averaged = {name: self._averaged(each) for name, each in values.items()}
         nodes, law = self._averaged(jet[0]), self._law_at_nodes()
         stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)
@@ -249,6 +247,35 @@ class SurfaceGatherer:
         return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(-1, *values.shape[2:])
 
 
+def add_contact(
+    values: dict[str, Array], model: "ShellModel | MeridianModel", state: State, at_nodes: Callable[[Array], Array]
+) -> None:
+    """Add the contact pressure and the gap between shells to fields at the nodes of cells; collective.
+
+    Beside the pressure it adds what `resolved_pressure` takes out again: `RESOLVED`, one in a cell that is pressed
+    all over; `RESOLVED_PRESSURE`, the pressure of such a cell; `GAP_OPEN`, one where there is a gap to a body.
+
+    Parameters
+    ----------
+    values
+        Name -> (cells, nodes of a cell). The gap to bodies is there already, over h.
+    at_nodes
+        Makes (cells, nodes of a cell) of a value of each local cell.
+    """
+    pressure = model.cell_pressures(state)
+    if pressure is not None:
+        resolved = at_nodes(model.cells_evenly_pressed(state).astype(np.float64))
+        gap_to_bodies = values.get(GAP, np.zeros(resolved.shape))
+        values[PRESSURE] = at_nodes(pressure)
+        values[RESOLVED] = resolved
+        values[RESOLVED_PRESSURE] = values[PRESSURE] * resolved
+        values[GAP_OPEN] = np.where(gap_to_bodies > LARGEST_CLOSED_GAP, 1.0, 0.0)
+    gap = model.cell_gaps(state)
+    if gap is not None:
+        gap_of_shells = at_nodes(gap) / model.material.h
+        values[GAP] = np.minimum(values.get(GAP, np.inf), gap_of_shells)
+
+
 def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dict[str, Array]:
     """Return the fields with the contact pressure where the mesh resolves it, and nan where not.
 
@@ -260,20 +287,21 @@ def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dic
     cells
         (m, k) node numbers.
     fields
-        At nodes, the means of the cells that meet there. Those are taken out: `EVEN`, one of a cell that is pressed
-        all over; `OF_EVEN`, its pressure; `OPEN`, one where there is a gap.
+        At nodes, the means of the cells that meet there, as `add_contact` makes them.
     """
     if PRESSURE not in fields:
         return fields
-    rest = {name: values for name, values in fields.items() if name not in {EVEN, OF_EVEN, OPEN}}
-    near = fields[EVEN] > 0
-    beside = near.copy()
-    beside[cells[near[cells].any(axis=1)]] = True
-    of_even = fields[OF_EVEN] / np.where(near, fields[EVEN], 1.0)
-    at_edge = np.where(beside & (fields[OPEN] > 0), 0.0, rest[PRESSURE])
-    pressure = np.where(near, of_even, at_edge)
-    rest[PRESSURE] = np.where((pressure > 0) & ~beside, np.nan, pressure)
-    return rest
+    auxiliary = {RESOLVED, RESOLVED_PRESSURE, GAP_OPEN}
+    drawn = {name: values for name, values in fields.items() if name not in auxiliary}
+    in_zone = fields[RESOLVED] > 0
+    in_zone_or_edge = in_zone.copy()
+    in_zone_or_edge[cells[in_zone[cells].any(axis=1)]] = True
+    pressure_in_zone = fields[RESOLVED_PRESSURE] / np.where(in_zone, fields[RESOLVED], 1.0)
+    edge_is_open = in_zone_or_edge & (fields[GAP_OPEN] > 0)
+    pressure_outside = np.where(edge_is_open, 0.0, drawn[PRESSURE])
+    pressure = np.where(in_zone, pressure_in_zone, pressure_outside)
+    drawn[PRESSURE] = np.where((pressure > 0) & ~in_zone_or_edge, np.nan, pressure)
+    return drawn
 
 
 def grown(growing: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]) -> list[Deviation]:

@@ -234,7 +234,7 @@ def contact(surface: Surface) -> list[Coloured]:
 
 
 def pressure_said(surface: Surface) -> str:
-    """What the drawn pressure is not: there is none, or it is narrower than a cell, or few cells carry it."""
+    """Return the note under the contact pressure: nothing touches, no cell resolves it, or few cells carry it."""
     pressure = surface.fields["contact_pressure"]
     unresolved, most = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
     if not most:
@@ -242,7 +242,7 @@ def pressure_said(surface: Surface) -> str:
         return narrow if unresolved else "Nothing touches."
     if unresolved:
         return "Where the contact is narrower than a cell of the mesh, no pressure is drawn."
-    number = int((surface.fields["contact_pressure"][surface.cells] > 0).all(axis=1).sum())
+    number = int((pressure[surface.cells] > 0).all(axis=1).sum())
     return f"The pressure is a mean over each cell; {number} carry it." if 0 < number < FEW else ""
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
 FACE = 1 + 1 + 3 + 1  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
-EVEN = 1.5  # largest over mean pressure in a cell whose mean is drawn, at most
+LARGEST_OVER_MEAN_PRESSURE = 1.5  # in a cell whose mean is drawn, at most
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
 
@@ -381,7 +381,7 @@ class Pressing:
     def evenly_pressed(self) -> NDArray[np.bool_]:
         """Whether all points of each local cell are pressed, and its mean is near its pressure."""
         size = self._sizes()
-        even = size.max(axis=1) <= EVEN * self.cell_pressures()
+        even = size.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
         return np.asarray((size > 0).all(axis=1) & even)
 
     def _sizes(self) -> Array:

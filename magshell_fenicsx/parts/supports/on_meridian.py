@@ -1,4 +1,4 @@
-"""What holds a meridian: displacements that are zero at its ends, and its rigid motions."""
+"""Supports of a meridian: displacements that are zero at its ends, and the rigid motions that they may stop."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +16,25 @@ from magshell_fenicsx.parts.supports.supports import RIGHT, no_mirror
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
+
+
+@dataclass(frozen=True)
+class RigidMotions:
+    """Rigid motions of a shell of revolution.
+
+    Attributes
+    ----------
+    along
+        Displacements (n, nodes times 2) along e3.
+    around
+        Waves m = 0 around e3, as coefficients (U + V, V, W), (n, nodes times 3).
+    across
+        Waves m = 1 that move the shell across e3 or turn it about an axis across it, likewise. Each has a twin.
+    """
+
+    along: Array
+    around: Array
+    across: Array
 
 
 @dataclass(frozen=True)
@@ -50,8 +69,8 @@ class Supports:
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
 
-    def held_unknowns(self, r0: fem.Function, wave: int) -> NDArray[np.int32]:
-        """Return the unknowns of a family of `rigid_motions` that are zero at the axis and at the supports.
+    def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
+        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `held_waves`, without their space.
 
         The nodes of the spaces of displacements and of waves have the same numbers.
         """
@@ -59,20 +78,11 @@ class Supports:
             fem.locate_dofs_topological(r0.function_space, 0, facets)
             for facets in (self.axis, self.horizontal, self.axial)
         )
-        if wave == 0:
-            return np.concatenate([2 * axis, 2 * horizontal, 2 * axial + 1])
-        at_axis = [3 * axis + i for i in ((0, 2) if wave == 1 else (0, 1, 2))]
+        at_axis = [3 * axis + i for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return np.concatenate([*at_axis, 3 * horizontal, 3 * horizontal + 1, 3 * axial + 2])
 
-    def rigid_motions(self, r0: fem.Function) -> dict[int, Array]:
-        """Return the rigid motions of each shell, or of those joined, whatever holds them.
-
-        Returns
-        -------
-        dict
-            Of m = 0 the displacements (bodies, nodes times 2) along e3; of -1 the waves m = 0 around it, and of 1 those
-            across it and about an axis across it, as coefficients (U + V, V, W), (n, nodes times 3).
-        """
+    def rigid_motions(self, r0: fem.Function) -> RigidMotions:
+        """Return the rigid motions of each shell, or of those joined, whatever holds them."""
         along, around, across = list[Array](), list[Array](), list[Array]()
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
@@ -83,7 +93,7 @@ class Supports:
             along.append(np.column_stack([zero, one]).ravel())
             around.append(np.column_stack([rho, rho, zero]).ravel())
             across += [np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])]
-        return {0: np.array(along), -1: np.array(around), 1: np.array(across)}
+        return RigidMotions(np.array(along), np.array(around), np.array(across))
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
