@@ -71,7 +71,12 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"no archive")
     (tmp_path / "b.csv").write_text("x,y,z,w0\n1,2\n3\n")
     (tmp_path / "c.csv").write_text("")
-    for name, words in (("a.npz", "no .npz"), ("b.csv", "lengths"), ("c.csv", "no rows"), ("d.csv", "No such file")):
+    for name, words in (
+        ("a.npz", "no .npz"),
+        ("b.csv", "4 names in its header and 2 columns in line 2"),
+        ("c.csv", "no rows"),
+        ("d.csv", "No such file"),
+    ):
         with pytest.raises(TableError, match=words):
             read_scan(tmp_path / name, BARE)
     with pytest.raises(TableError, match="has the unit mm, but the shell's lengths have none"):
