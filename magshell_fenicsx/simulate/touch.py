@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
@@ -30,6 +31,7 @@ FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn;
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
+CERTAIN = 0.5  # of a critical mode's stiffness: what closer points of contact may change of it
 PASSED = 8  # halvings of a way on which shells would pass through each other
 HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
@@ -113,6 +115,31 @@ def recut(stage: Stage, low: Point, high: Point) -> State | None:
     """
     changed = better_cuts(stage.scene, stage.leave(high.state))
     return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+
+def resolved(stage: Stage, low: Point, high: Point) -> State | None:
+    """The state of the first of two points with closer points of contact, where an instability lies between them.
+
+    None if there is none, or if closer points change neither the number of unstable directions of both nor much of
+    their critical modes' stiffness: of an instability that they move, nobody knows whether it is one.
+    """
+    if not high.turned_from(low):
+        return None
+    scene, state = stage.scene, stage.leave(high.state)
+    at = scene.model.system.at(state)
+    numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}
+    changed = {name: number for name, number in numbers.items() if number is not None}
+    if not changed or all(_certain(stage, point, changed) for point in (high, low)):
+        return None
+    return State(low.state.u, {**low.state.mu, **changed})
+
+
+def _certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
+    """Whether the critical mode's stiffness at a point is certain within `CERTAIN` of it, by closer points."""
+    given, other = point.state, State(point.state.u, {**point.state.mu, **finer})
+    mode, compared = (critical_mode(stage.newton, state) for state in (given, other))
+    error = abs(compared.eigenvalue - mode.eigenvalue)
+    return compared.negative_pivots == mode.negative_pivots and error < CERTAIN * abs(mode.eigenvalue)
 
 
 def better_cuts(scene: Scene, state: State) -> dict[str, float]:

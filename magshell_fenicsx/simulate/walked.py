@@ -24,6 +24,7 @@ from magshell_fenicsx.simulate.touch import (
     refuse_crossing,
     refuse_passing,
     refuse_return,
+    resolved,
     stiffer,
 )
 
@@ -69,7 +70,8 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
-    """A walk on which bodies become stiffer and shells are cut anew; magnets on the way and returning bodies end it."""
+    """A walk on which bodies become stiffer, and shells are cut anew and get closer points where these move an
+    instability; magnets on the way and returning bodies end it."""
 
     cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
 
@@ -79,10 +81,13 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
         refuse_passing(stage, low, high)
         if goal.until != "points":
             refuse_return(stage, path.name, walk.points, high)
-        if (raised := stiffer(stage, low, high)) or low.s == cut_at:  # slid points are better than none
+        if raised := stiffer(stage, low, high):
             return raised
-        cut_at = low.s
-        return recut(stage, low, high)
+        if low.s != cut_at:  # slid points are better than none
+            cut_at = low.s
+            if cut := recut(stage, low, high):
+                return cut
+        return resolved(stage, low, high)
 
     walk = Walk(path, start, goal, checked)  # which `checked` looks at
     return walk

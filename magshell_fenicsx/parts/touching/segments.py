@@ -9,6 +9,10 @@ Engineering 193 (2004) 601-629.
 The cuts are those at an earlier state, whose number stands in a state as part of its history. So the points stay where
 they are on their surface while a state is solved: energy, forces and tangent are exact derivatives of each other, and
 need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the cuts anew.
+
+Two curved surfaces touch in a zone that may be narrower than the distance of the points. Its force then sits on single
+points and goes along with their material, so that a mode which slides there seems to be unstable. For such states the
+triangles in the zone are divided, as often as the number of the cuts says: see `Cuts`.
 """
 
 import hashlib
@@ -35,7 +39,9 @@ INSIDE = -1  # a triangle that is not on an edge
 TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that have points
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
-DIGITS = 6  # bytes of the number of a state: a float has all of them
+DIGITS = 6  # bytes of the hash of a displacement in the number of its cuts
+LEVELS = 16  # numbers of divisions that the number of cuts can tell apart: with the hash, a float has all digits
+CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])  # in the reference triangle
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,8 @@ class Points:
         (n,) the cell that a point faced where the cuts were made; `NOBODY` where it faced none.
     on_edge
         (n,) whether it is on an edge of the surface.
+    divisions
+        (n,) how often its triangle was divided.
     """
 
     cell: Longs
@@ -61,6 +69,7 @@ class Points:
     weight: Array
     faces: Longs
     on_edge: Inside
+    divisions: Longs
 
     @cached_property
     def by_cell(self) -> tuple[Longs, Longs]:
@@ -107,6 +116,20 @@ class Triangles:
     def of(self, which: Inside) -> "Triangles":
         """Some of them."""
         return Triangles(*(getattr(self, each.name)[which] for each in fields(self)))
+
+    def divided(self) -> "Triangles":
+        """Return the four halves of each: at the first corner, at both ends of the third side, and in the middle."""
+        half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
+        inside = np.full_like(self.ends, INSIDE)
+        at_begin, at_end = (np.where(self.ends == INSIDE, INSIDE, self.ends & corner) for corner in (1, 2))
+        quarters = (
+            (self.first, half1, half2, inside),
+            (self.first + half1, half1, half2, at_begin),
+            (self.first + half2, half1, half2, at_end),
+            (middle, -half1, -half2, inside),
+        )
+        first, e1, e2, ends = (np.concatenate(each) for each in zip(*quarters, strict=True))
+        return Triangles(np.tile(self.cell, 4), np.tile(self.faces, 4), first, e1, e2, ends)
 
 
 @dataclass(frozen=True)
@@ -256,9 +279,9 @@ class Segments:
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         inside, at_edge = covers(inner_rule(degrees[0])[0]), covers(ending_rule(degrees[0])[0])
         self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(inside, at_edge), inside)
-        self.rule = Points.joined(self._on(Pieces.cells(own)))
+        self.rule = Points.joined(self._on(self._triangles(Pieces.cells(own))))
 
-    def points(self, near: Places, r: Array) -> Points:
+    def points(self, near: Places, r: Array, divisions: int, gaps: Callable[[Points], Array]) -> Points:
         """All points of this rank.
 
         Parameters
@@ -267,6 +290,10 @@ class Segments:
             Places in all cells that are near the rule's points.
         r
             (nodes, 3) where the cuts are made.
+        divisions
+            How often triangles in which the gap may be closed are divided into four.
+        gaps
+            Return the gaps (n,) of points (n) there, over R.
         """
         number, rule = len(self._cells.nodes), self.rule
         if not len(near.point):
@@ -276,31 +303,46 @@ class Segments:
         order = np.argsort(self._corners(self._r0, other).mean(axis=1) @ ALONG, kind="stable")
         one, other = one[order], other[order]
         pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
-        return Points.joined([rule.of(~np.isin(rule.cell, one)), *self._on(pieces)])
+        points, triangles = [rule.of(~np.isin(rule.cell, one))], self._triangles(pieces)
+        for number in range(divisions):
+            closing = self._closing(triangles, gaps)
+            points += self._on(triangles.of(~closing), number)
+            triangles = triangles.of(closing).divided()
+        return Points.joined([*points, *self._on(triangles, divisions)])
 
-    def _on(self, pieces: Pieces) -> list[Points]:
-        """The points on pieces, by the triangles that they are cut into."""
+    def _closing(self, triangles: Triangles, gaps: Callable[[Points], Array]) -> Inside:
+        """Whether the gap in triangles (n,) may be closed: it changes there by as much again as between some points."""
+        X = CORNERS_AND_CENTROID
+        gap = gaps(self._by_rule(triangles, X, np.ones(len(X)), 0)).reshape(-1, len(X))
+        return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
+
+    def _triangles(self, pieces: Pieces) -> Triangles:
+        """The triangles that pieces are cut into."""
         triangles = pieces.triangles(self._cells.across < 0, self._turns)
-        triangles = triangles.of(triangles.size > NOTHING)
+        return triangles.of(triangles.size > NOTHING)
+
+    def _on(self, triangles: Triangles, divisions: int = 0) -> list[Points]:
+        """The points on triangles that are divided so often."""
         c, along = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
         side = np.linalg.norm(np.einsum("na,nai->ni", along, c[:, 1:] - c[:, :1]), axis=1)
         corner = np.minimum(np.exp2(np.round(np.log2(self._before / side))), 1 / 64)  # of few values, so of few rules
-        kind = np.stack([triangles.size <= 2 * LARGE, triangles.ends, np.where(triangles.ends > 0, corner, 0)], axis=1)
+        small = triangles.size * 4**divisions <= 2 * LARGE
+        kind = np.stack([small, triangles.ends, np.where(triangles.ends > 0, corner, 0)], axis=1)
         made, (kinds, number) = list[Points](), np.unique(kind, axis=0, return_inverse=True)
         for k, (small, ends, part) in enumerate(kinds):
             degree = self._degrees[int(small)]
             rule = inner_rule(degree) if ends == INSIDE else ending_rule(degree, int(ends), float(part))
-            made.append(self._by_rule(triangles.of(number.ravel() == k), *rule))
+            made.append(self._by_rule(triangles.of(number.ravel() == k), *rule, divisions))
         return made
 
-    def _by_rule(self, triangles: Triangles, X: Array, weights: Array) -> Points:
+    def _by_rule(self, triangles: Triangles, X: Array, weights: Array, divisions: int) -> Points:
         at = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None] + X[:, 1:] * triangles.e2[:, None]
         cell, faces = (np.repeat(each, len(X)) for each in (triangles.cell, triangles.faces))
         table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         weight = np.outer(triangles.size, weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
         on_edge = np.outer(triangles.ends != INSIDE, X.sum(axis=1) > 1 - 2 * BEFORE).ravel()
-        return Points(cell, table[0], weight, faces, on_edge)
+        return Points(cell, table[0], weight, faces, on_edge, np.full(len(cell), divisions))
 
     def normals(self, r: Array) -> Array:
         """(cells, 3) of the planes through the corners."""
@@ -324,16 +366,26 @@ class Segments:
 
 
 class Cuts:
-    """The points with the cuts of displacements, which have numbers; 0 is undeformed.
+    """The points with the cuts of displacements, which have numbers; 0 is undeformed, without divisions.
+
+    A number is `LEVELS` times a hash of the displacement, plus how often triangles in a zone of contact are divided.
 
     Parameters
     ----------
     near
         The places in all cells that are near the rule's points at a displacement (nodes, 3).
+    gaps
+        The gaps (n,) over R of points at a displacement.
     """
 
-    def __init__(self, segments: Segments, near: Callable[[Array], Places], r0: Array) -> None:
-        self._segments, self._near, self._r0 = segments, near, r0
+    def __init__(
+        self,
+        segments: Segments,
+        near: Callable[[Array], Places],
+        gaps: Callable[[Points, Array], Array],
+        r0: Array,
+    ) -> None:
+        self._segments, self._near, self._gaps, self._r0 = segments, near, gaps, r0
         self._displacements = {0.0: np.zeros_like(r0)}
         self._latest = dict[float, tuple[Points, Array]]()
 
@@ -342,22 +394,31 @@ class Cuts:
         becomes that of u."""
         if number not in self._latest:
             at = self._displacements.setdefault(number, np.array(u))
-            self._latest = {**dict([*self._latest.items()][-1:]), number: self.at(at)}
+            made = self.at(at, divisions_of(number))
+            self._latest = {**dict([*self._latest.items()][-1:]), number: made}
         return self._latest[number]
 
     def displacement(self, number: float) -> Array:
         """That of a number of which there are points."""
         return self._displacements[number]
 
-    def at(self, u: Array) -> tuple[Points, Array]:
+    def at(self, u: Array, divisions: int) -> tuple[Points, Array]:
         """Those of a displacement."""
-        return self._segments.points(self._near(u), self._r0 + u), self._segments.normals(self._r0 + u)
+        r = self._r0 + u
+        points = self._segments.points(self._near(u), r, divisions, lambda points: self._gaps(points, u))
+        return points, self._segments.normals(r)
 
-    def numbered(self, u: Array) -> float:
-        """The number of a displacement, the same for the same one."""
-        number = float(int.from_bytes(hashlib.blake2b(np.array(u).tobytes(), digest_size=DIGITS).digest()))
+    def numbered(self, u: Array, divisions: int) -> float:
+        """The number of a displacement with so many divisions, the same for the same ones."""
+        digest = hashlib.blake2b(np.array(u).tobytes(), digest_size=DIGITS).digest()
+        number = float(LEVELS * int.from_bytes(digest) + divisions)
         self._displacements[number] = np.array(u)
         return number
+
+
+def divisions_of(number: float) -> int:
+    """How often triangles are divided with cuts of this number."""
+    return int(number) % LEVELS
 
 
 def sides_of(triangles: Array) -> tuple[Array, Array]:

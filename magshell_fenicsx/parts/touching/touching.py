@@ -33,7 +33,7 @@ from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
-from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments
+from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments, divisions_of
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
@@ -41,6 +41,7 @@ AHEAD = 1.0  # of the thickness: cells that are nearer than that have room in th
 EVERYWHERE = 1 - 1e-9  # of the area of a cell, but for rounding
 CHUNK = 1000  # blocks of a tangent at a time
 ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
+MOST_DIVISIONS = 8  # of triangles in a zone of contact: each halves the distance of its points
 PART = 0.25  # of the thickness: how far points move between two looks at a step
 NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
 
@@ -94,7 +95,7 @@ class Touching(ContactTerm):
         self._far = h + (REACH - 1) * 2 * float(self._facing.half[nodes].max())
         self._at = np.full_like(r0, np.nan)
         self._grown = 0.0  # the natural stretch there
-        self._cuts = Cuts(segments, self._near, r0)
+        self._cuts = Cuts(segments, self._near, self._gaps, r0)
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
@@ -339,18 +340,40 @@ class Touching(ContactTerm):
         astray = self._astray(self._points, at, turned)
         if astray <= ASTRAY:
             return None
-        points, normals = self._cuts.at(u)
-        places = self._facing.found(u, self._h, points)
-        counted = places.of(~self._facing.left_to_edges(points, places, normals))
-        return self._cuts.numbered(u) if self._astray(points, counted) < astray / 2 else None
+        points, counted = self._with_cuts_at(u, self._divisions)
+        better = self._astray(points, counted) < astray / 2
+        return self._cuts.numbered(u, self._divisions) if better else None
+
+    def finer(self) -> float | None:
+        """The number of the present displacement with triangles in the zone of contact divided once more; collective.
+
+        None if nothing touches, or if they are divided `MOST_DIVISIONS` times.
+        """
+        u, divisions = self._now(), self._divisions
+        at, *_ = self._pressed()
+        if divisions == MOST_DIVISIONS or not self._comm.allreduce(len(at.point)):
+            return None
+        return self._cuts.numbered(u, divisions + 1)
 
     def numbered(self) -> float:
         """The number of the present displacement, for cuts there; collective."""
-        return self._cuts.numbered(self._now())
+        return self._cuts.numbered(self._now(), self._divisions)
+
+    @property
+    def _divisions(self) -> int:
+        return divisions_of(self.cuts.value)
+
+    def _with_cuts_at(self, u: Array, divisions: int) -> tuple[Points, Places]:
+        """The points with cuts at a displacement, and their places that count there."""
+        points, normals = self._cuts.at(u, divisions)
+        places = self._facing.found(u, self._h, points)
+        return points, places.of(~self._facing.left_to_edges(points, places, normals))
 
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
-        """The part of the force at points that do not face what they faced, or on what is `turned`."""
-        other = at.of(points.faces[at.point] != at.cell)
+        """The part of the force at points that do not face what they faced, on what is `turned`, or where triangles
+        are divided less often than in the zone of contact."""
+        elsewhere = points.faces[at.point] != at.cell
+        other = at.of(elsewhere | (points.divisions[at.point] < self._divisions))
         whole, part = self._comm.allreduce(np.array([self._force(points, at), self._force(points, other) + turned]))
         return float(part / whole) if whole else float(part > 0)
 
@@ -365,6 +388,13 @@ class Touching(ContactTerm):
         far = self._h + self._segments.within
         near = self._facing.places_in(self._rule, u, self._facing.placed(u), float(far.max()))
         return self._facing.of_far_cells(self._rule, near.of(near.distance < far[self._rule.cell[near.point]]))
+
+    def _gaps(self, points: Points, u: Array) -> Array:
+        """The gaps (n,) of points at a displacement over R, as far as they are looked for."""
+        places = self._facing.found(u, self._far, points)
+        distance = np.full(len(points.cell), self._far)
+        np.minimum.at(distance, places.point, places.distance)
+        return np.asarray(distance - self._h)
 
     # geometry
 
