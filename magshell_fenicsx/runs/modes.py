@@ -127,13 +127,9 @@ class _Writer:
 
 
 def _waves_said(point: int, waves: Waves) -> str:
-    """How many waves a null vector has, or that its mesh does not resolve them."""
-    if waves.resolved:
-        return f"the null vector at point {point} has {waves.number} waves around e3"
-    return (
-        f"warning: the mesh does not resolve the waves of the null vector at point {point} around e3: "
-        f"it has {waves.number}, on a ring that resolves {waves.largest}"
-    )
+    """How many waves a null vector has, with a warning where its mesh does not resolve them."""
+    said = f"the null vector at point {point} has {waves.number} waves around e3"
+    return said if waves.resolved else f"warning: {said}, and the mesh resolves {waves.largest}"
 
 
 def write_mode_of(
