@@ -105,6 +105,18 @@ def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_mode_has_one_name_in_both_files(tmp_path: Path) -> None:
+    """A high arch buckles to one side: path.csv of its half and boundary.csv, on the whole, call it antisymmetric."""
+    setting = f"{KEY}=2.6"
+    run = magshell("run", ARCH, "--set", setting, "--out", tmp_path / "run", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    first = next(row for row in read_path(tmp_path / "run") if row["label"] == "bifurcation")
+    found = ms.boundary(ARCH, f"{KEY}=2.59:2.6:1", [setting], tmp_path / "b")
+    assert {row["mode"] for row in found.rows} == {first["mode"]} == {"antisymmetric"}
+    assert found.content["mode"] == "antisymmetric"
+
+
+@pytest.mark.slow
 def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
     """The symmetric fold beyond the bifurcation, which the case alone does not start from, by its closed form."""
     run, onward = tmp_path / "run", ["loading.1.until=points", "loading.1.points=40", f"{KEY}=2.6"]
