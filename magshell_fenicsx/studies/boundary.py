@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.continuation.augmented import Locus, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
-from magshell_fenicsx.continuation.critical import critical
+from magshell_fenicsx.continuation.critical import critical, first_mode
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -197,7 +197,8 @@ def boundary(
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
         if not begin["label"]:
             instability([])
-        begin = {**begin, "name_of_mode": name_of_mode if begin["label"] == "bifurcation" else begin["mode"]}
+        name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
+        begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
         once(f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
@@ -331,6 +332,8 @@ def _followed(
     try:
         mode = curve(varied.m)
         start = mode.start(value, *varied.start)
+        if begin["is_first"]:
+            mode, start = first_mode(curve, varied.mode_at, mode, start)
         rows.append(_row(varied, "start", start, mode, begin["name_of_mode"]))
         for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
             take(label, locus, on)
