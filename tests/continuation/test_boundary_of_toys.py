@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.augmented import Kind, Locus
 from magshell_fenicsx.continuation.boundary import Boundary, Label
-from magshell_fenicsx.continuation.critical import critical
+from magshell_fenicsx.continuation.critical import critical, first_mode
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
@@ -197,6 +197,12 @@ def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> N
     assert found[-1][0] == "end"
 
 
+def first_sine(rise: float) -> Toy:
+    """The arch's first sine alone."""
+    gradient, hessian = arch(rise).gradient, arch(rise).hessian
+    return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+
+
 @dataclass
 class WithoutThree(WithoutModes):
     """The arch's first sine alone. The third family that it excludes touches the second one where the first crosses it.
@@ -228,11 +234,7 @@ def test_the_first_of_three_modes_that_meet_is_followed(
     It is so as well where crossings with it cannot be located.
     """
 
-    def alone(rise: float) -> Toy:
-        gradient, hessian = arch(rise).gradient, arch(rise).hessian
-        return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
-
-    toys = WithoutThree(alone, gap=gap)
+    toys = WithoutThree(first_sine, gap=gap)
     meeting = Boundary._meeting
     if missed:
         monkeypatch.setattr(Boundary, "_meeting", lambda self, *args: None if args[-1] == 3 else meeting(self, *args))
@@ -251,3 +253,19 @@ def test_the_first_of_three_modes_that_meet_is_followed(
         assert toys.neutral(on.m, locus.p) == pytest.approx(first, abs=1e-6)
         assert locus.state.mu["load"] == pytest.approx(load_of(np.sqrt(locus.p**2 - first), locus.p), rel=1e-6)
         assert not locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
+
+
+@pytest.mark.parametrize(("gap", "taken"), [(1e-4, 3), (-1e-3, 2), (0.5, 2)])
+def test_a_start_is_that_of_the_first_of_two_modes_that_are_near(gap: float, taken: int) -> None:
+    """The second mode is named, the third is first by a gap; one that comes long before is another instability."""
+    toys, rise = WithoutThree(first_sine, gap=gap), 2.75
+
+    def curve(m: int, *_: object) -> Boundary:
+        return Boundary(toys, "load", "bifurcation", (10.0, 1.0), m=m)
+
+    a = np.sqrt(rise**2 - neutral(2, rise))
+    start = curve(2).start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1))
+    mode, begun = first_mode(curve, lambda *_: np.ones(1), curve(2), start)
+    thrust = rise**2 - (rise - begun.state.u[0]) ** 2
+    assert mode.m == taken
+    assert thrust == pytest.approx(toys.neutral(taken, rise), abs=1e-9)
