@@ -150,7 +150,7 @@ class _Search:
         self, families: Sequence[int], taken_up: Callable[[int], Iterator[_Onward]], mode: Boundary, locus: Locus
     ) -> _Onward:
         """The first mode of some families, and of those that prove to be unstable before these."""
-        asked, why = [*families], ""
+        asked, why = [*families], "none that comes before it is the first there"
         for family in asked:  # which grows
             try:
                 for onward in taken_up(family):
@@ -159,9 +159,11 @@ class _Search:
                     found = _families_before(onward.mode, onward.start)
                     asked += [other for other in found if other not in asked and other != mode.m]
             except (BoundaryLost, NoSystem) as e:
-                why = f": {e}"
+                why = str(e)
         load = locus.state.mu[mode.name]
-        raise BoundaryLost(f"at {locus.p:.6g}, load {load:.6g}: another mode is unstable first, and is not found{why}")
+        raise BoundaryLost(
+            f"at {locus.p:.6g}, load {load:.6g}: another mode is unstable first, and is not found: {why}"
+        )
 
 
 def _families_before(mode: Boundary, locus: Locus) -> list[int]:

@@ -128,8 +128,10 @@ class _Writer:
 
 def _waves_said(point: int, waves: Waves) -> str:
     """How many waves a null vector has, with a warning where its mesh does not resolve them."""
-    said = f"the null vector at point {point} has {waves.number} waves around e3"
-    return said if waves.resolved else f"warning: {said}, and the mesh resolves {waves.largest}"
+    m, largest = waves.number, waves.largest
+    if waves.resolved:
+        return f"the null vector at point {point} has {m} waves around e3"
+    return f"warning: the null vector at point {point} has {m} waves around e3, and the mesh resolves {largest}"
 
 
 def write_mode_of(
