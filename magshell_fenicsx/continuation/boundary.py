@@ -162,9 +162,15 @@ class Boundary:
         families = range(max(len(low.counts), len(high.counts)))
         changed = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
         met_by = {i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i) for i in changed}
+        counts = [low.unstable_of(i) for i in families]
         for i, met in sorted(met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0):
-            if met:
-                yield ("meeting" if i == self.m == 0 else "crossing"), replace(met, met=i)
+            if met is None:
+                continue
+            if i == self.m == 0:
+                yield "meeting", replace(met, met=i)
+            else:  # its own counts are those of a point close by, which may be beyond other crossings
+                yield "crossing", replace(met, met=i, counts=tuple(counts), unstable=sum(counts))
+            counts[i] = high.unstable_of(i)
 
     def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
         """The point after a step: by the cubic through the last two points and their tangents."""
@@ -300,7 +306,9 @@ class Boundary:
             s = (a + b) / 2
             if len(looked_at) > 1:
                 ahead = interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
-                if abs(ahead - looked_at[0][0]) < close * length:
+                nearest_place = looked_at[0][0]
+                by_rounding = not a < ahead < b and abs(ahead - nearest_place) < CLOSE * length
+                if by_rounding or abs(ahead - nearest_place) < close * length:
                     s = ahead
                     break
                 s = ahead if a < ahead < b else s

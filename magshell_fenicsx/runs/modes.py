@@ -18,10 +18,10 @@ from magshell_fenicsx.output.fields.modes import (
     mode_file,
     mode_surface,
     mode_table,
-    wave_number,
     wave_of,
     write_mode,
 )
+from magshell_fenicsx.output.fields.ring import Waves, waves_around
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About
 from magshell_fenicsx.output.store.durable import write_whole
@@ -94,8 +94,8 @@ class _Writer:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
                 exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
                 self.result.largest[number] = [float(x) for x in exact * scene.problem.length]
-            if surface is not None and not label and (m := wave_number(surface)):
-                self.say(f"the null vector at point {number} has {m} waves around e3")
+            if surface is not None and not label and (waves := waves_around(surface)):
+                self.say(_waves_said(number, waves))
 
     def modes(self, wanted: StabilitySection) -> None:
         points = self.result.singular
@@ -124,6 +124,14 @@ class _Writer:
     def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
         file = mode_file(self.folder, number, name, label)
         return write_mode_of(self.result.scene_of(number), self._of(number)[1], file, state, label, vector)
+
+
+def _waves_said(point: int, waves: Waves) -> str:
+    """How many waves a null vector has, with a warning where its mesh does not resolve them."""
+    m, largest = waves.number, waves.largest
+    if waves.resolved:
+        return f"the null vector at point {point} has {m} waves around e3"
+    return f"warning: the null vector at point {point} has {m} waves around e3, and the mesh resolves {largest}"
 
 
 def write_mode_of(

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.continuation.augmented import Locus, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
-from magshell_fenicsx.continuation.critical import critical
+from magshell_fenicsx.continuation.critical import critical, first_mode
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -189,13 +189,16 @@ def boundary(
         journal = partial(Journal, folder / "points", _identity(source, span, made, begun_at.text))
         value = _value(source, span, made, outside=not start)
         begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
-        if begin["mode"] == "antisymmetric":
+        name_of_mode = begin["mode"]
+        if name_of_mode == "antisymmetric":
             once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             again = begun_at.anywhere()
             begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
         if not begin["label"]:
             instability([])
+        name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
+        begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
         once(f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}")
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
@@ -314,7 +317,7 @@ def _followed(
     begun, end = time.perf_counter(), span.ends[sense > 0]
 
     def take(label: Label, locus: Locus, mode: Boundary) -> None:
-        row = _row(varied, label, locus, mode)
+        row = _row(varied, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
         part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
@@ -329,7 +332,9 @@ def _followed(
     try:
         mode = curve(varied.m)
         start = mode.start(value, *varied.start)
-        rows.append(_row(varied, "start", start, mode))
+        if begin["is_first"]:
+            mode, start = first_mode(curve, varied.mode_at, mode, start)
+        rows.append(_row(varied, "start", start, mode, begin["name_of_mode"]))
         for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
             take(label, locus, on)
     except (BoundaryLost, NoSystem) as e:
@@ -339,9 +344,10 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": varied.alone}
 
 
-def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary) -> dict[str, Any]:
+def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mode: str) -> dict[str, Any]:
+    """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the whole."""
     families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
-    own = "" if varied.m else varied.mode
+    own = "" if varied.m else name_of_mode
     if len(families) > 1 and not families[0]:
         own = varied.kind_of(0, locus)
     return {
@@ -388,7 +394,7 @@ def _put_together(
         "to": span.last,
         "load": begin["amplitude"],
         "kind": begin["label"],
-        "mode": begin["mode"],
+        "mode": begin["name_of_mode"],
         "points": len(rows),
         "special": special,
         "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.augmented import Kind, Locus
 from magshell_fenicsx.continuation.boundary import Boundary, Label
-from magshell_fenicsx.continuation.critical import critical
+from magshell_fenicsx.continuation.critical import critical, first_mode
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
@@ -195,3 +195,77 @@ def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> N
         assert locus.state.mu["load"] == pytest.approx(load_of(a, locus.p), rel=1e-6)
         assert label == "crossing" or not locus.unstable
     assert found[-1][0] == "end"
+
+
+def first_sine(rise: float) -> Toy:
+    """The arch's first sine alone."""
+    gradient, hessian = arch(rise).gradient, arch(rise).hessian
+    return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+
+
+@dataclass
+class WithoutThree(WithoutModes):
+    """The arch's first sine alone. The third family that it excludes touches the second one where the first crosses it.
+
+    There it is neutral at a thrust that is lower by `gap`.
+    """
+
+    gap: float = 0.0
+
+    def neutral(self, m: int, rise: float) -> float:
+        return neutral(m, rise) if m < 3 else neutral(2, rise) - 0.1 * (rise - 2.8) ** 2 - self.gap
+
+    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+        return float(8 * (self.neutral(m, p) - p**2 + (p - state.u[0]) ** 2) * v @ v)
+
+    def counts(self, p: float, state: State) -> list[int]:
+        return [int(self.along(p, state, m, np.ones(1)) < 0) for m in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("gap", "missed"),
+    [(0.0, False), (-1e-9, False), (-1e-6, False), (1e-6, False), (1e-3, False), (0.0, True), (-1e-6, True)],
+)
+def test_the_first_of_three_modes_that_meet_is_followed(
+    gap: float, missed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of them differ by their gap alone where all meet, at a rise of 2.8; the third is the first one beyond.
+
+    It is so as well where crossings with it cannot be located.
+    """
+
+    toys = WithoutThree(first_sine, gap=gap)
+    meeting = Boundary._meeting
+    if missed:
+        monkeypatch.setattr(Boundary, "_meeting", lambda self, *args: None if args[-1] == 3 else meeting(self, *args))
+
+    def curve(m: int, *_: object) -> Boundary:
+        return Boundary(toys, "load", "bifurcation", (10.0, 1.0), m=m)
+
+    a = np.sqrt(3.2**2 - 4)
+    mode = curve(1)
+    start = mode.start(3.2, State(np.array([3.2 - a]), {"load": load_of(a, 3.2)}), np.ones(1))
+    found = [*critical(curve, lambda *_: np.ones(1), mode, start, -1.0, (2.42, 3.3), 20)]
+    assert [locus.p for label, locus, _ in found if label == "end"] == [2.42]
+    assert found[-1][2].m == 3
+    for label, locus, on in found:
+        first = min(toys.neutral(m, locus.p) for m in (1, 2, 3))
+        assert toys.neutral(on.m, locus.p) == pytest.approx(first, abs=1e-6)
+        assert locus.state.mu["load"] == pytest.approx(load_of(np.sqrt(locus.p**2 - first), locus.p), rel=1e-6)
+        assert not locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
+
+
+@pytest.mark.parametrize(("gap", "taken"), [(1e-4, 3), (-1e-3, 2), (0.5, 2)])
+def test_a_start_is_that_of_the_first_of_two_modes_that_are_near(gap: float, taken: int) -> None:
+    """The second mode is named, the third is first by a gap; one that comes long before is another instability."""
+    toys, rise = WithoutThree(first_sine, gap=gap), 2.75
+
+    def curve(m: int, *_: object) -> Boundary:
+        return Boundary(toys, "load", "bifurcation", (10.0, 1.0), m=m)
+
+    a = np.sqrt(rise**2 - neutral(2, rise))
+    start = curve(2).start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1))
+    mode, begun = first_mode(curve, lambda *_: np.ones(1), curve(2), start)
+    thrust = rise**2 - (rise - begun.state.u[0]) ** 2
+    assert mode.m == taken
+    assert thrust == pytest.approx(toys.neutral(taken, rise), abs=1e-9)

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface, completed
+from magshell_fenicsx.output.fields.tessellation import tessellated
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu, write_whole_shells
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import Coloured, loads, moments, strains
@@ -33,7 +34,6 @@ from magshell_fenicsx.output.pictures.view import (
     InView,
     Window,
     axes_on_screen,
-    tessellated,
     towards,
 )
 from magshell_fenicsx.output.store.known import pole_of

@@ -11,11 +11,13 @@ import pytest
 import pyvista
 from command import magshell, started
 from conftest import CASES
+from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.modes import mode_surface, wave_number
+from magshell_fenicsx.output.fields.ring import waves_around
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.public import run
 from magshell_fenicsx.shells.modes import ShellModes
@@ -54,14 +56,26 @@ def test_clamped_plate_by_half_and_whole() -> None:
     assert Counter(label for label, _ in half[:6]) == {"": 4, "antisymmetric": 2}
 
 
+def band_of_triangles(rows: int, around: int, *, closed: bool = True) -> NDArray[np.int64]:
+    """The triangles between rows of nodes; of rows that are closed the last nodes are beside the first."""
+    row, node = (x.ravel() for x in np.meshgrid(np.arange(rows - 1), np.arange(around - (not closed)), indexing="ij"))
+    beside = (node + 1) % around
+    a, b, c, d = row * around + node, row * around + beside, (row + 1) * around + node, (row + 1) * around + beside
+    return np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
+
+
+def drawn_mode(r0: NDArray[np.float64], w: NDArray[np.float64], cells: NDArray[np.int64]) -> Surface:
+    return Surface(r0, 0 * r0, r0, cells, {"mode_w": w})
+
+
 def test_a_dent_between_small_elements_has_no_waves() -> None:
-    """Nodes of a ring count by their distance: most of them are in a dent, which a wave of few crests fits there."""
-    theta = np.concatenate([np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)])
-    r0 = np.column_stack([np.cos(theta), np.sin(theta), 1e-3 * theta])
-    r0 = np.concatenate([r0, [[0.0, 0.0, 1.0]]])  # it is not flat
+    """Points of a ring count by their distance: most of them are in a dent, which a wave of few crests fits there."""
+    theta = np.concatenate([np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)[1:-1]])
+    rim = np.column_stack([np.cos(theta), np.sin(theta), 1e-3 * np.sin(theta)])  # it is not even
+    r0 = np.concatenate([rim, rim + np.array([0.0, 0.0, 1.0])])
+    cells = band_of_triangles(2, len(theta))
     for w, waves in ((np.exp(-((theta / 0.5) ** 2)), None), (np.cos(3 * theta), 3)):
-        fields = {"mode_w": np.append(w, 0.0)}
-        assert wave_number(Surface(r0, 0 * r0, r0, np.zeros((0, 3), int), fields)) == waves
+        assert wave_number(drawn_mode(r0, np.concatenate([w, 0 * w]), cells)) == waves
 
 
 @cache
@@ -285,5 +299,34 @@ def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | N
     theta, phi = (x.ravel() for x in np.meshgrid(around, down))
     n0 = np.column_stack([np.sin(phi) * np.cos(theta), np.sin(phi) * np.sin(theta), np.cos(phi)])
     w = np.cos(m * (theta - 0.3)) * np.exp(-50 * (phi - 1.3) ** 2)
-    surface = Surface(n0, 0 * n0, n0, np.empty((0, 3), dtype=np.int64), {"mode_w": w})
-    assert wave_number(surface) == counted
+    cells = band_of_triangles(30, 400, closed=turn == 2)
+    assert wave_number(drawn_mode(n0, w, cells)) == counted
+
+
+@pytest.mark.parametrize("staggered", [0.0, 1 / 3, 0.5])
+@pytest.mark.parametrize(("m", "resolved"), [(2, True), (3, True), (5, True), (8, False)])
+def test_waves_are_counted_whatever_nodes_lie_on_rings(m: int, staggered: float, resolved: bool) -> None:
+    """cos(m theta) at 21 nodes around, on rows so near that one ring has three: there 63 - m and 42 + m fit as well.
+
+    Where rows are staggered, a row's nodes are between those of the next. Eight waves have less than three nodes each.
+    """
+    node, row = (x.ravel() for x in np.meshgrid(np.arange(21), np.arange(41)))
+    theta, z = 2 * np.pi * (node + staggered * row) / 21, 0.015 * row
+    r0 = np.column_stack([np.cos(theta), np.sin(theta), z])
+    w = np.cos(m * theta - 4 * z) * np.exp(-50 * (z - 0.3) ** 2)
+    waves = waves_around(drawn_mode(r0, w, band_of_triangles(41, 21)))
+    assert waves is not None
+    assert waves.resolved == resolved
+    if resolved:
+        assert waves.number == m
+
+
+def test_waves_are_counted_on_an_irregular_mesh() -> None:
+    """cos(3 theta) at nodes of which no two have one height, the largest of all 0.07 R from the next."""
+    chance = np.random.default_rng(0)
+    node, row = (x.ravel() for x in np.meshgrid(np.arange(24), np.arange(9)))
+    theta = 2 * np.pi * (node + row / 2 + 0.3 * chance.uniform(-0.5, 0.5, len(node))) / 24
+    z = 0.25 * (row + 0.3 * chance.uniform(-0.5, 0.5, len(node)))
+    r0 = np.column_stack([np.cos(theta), np.sin(theta), z])
+    w = np.cos(3 * theta - z) * np.sin(np.pi * z / 2)
+    assert wave_number(drawn_mode(r0, w, band_of_triangles(9, 24))) == 3

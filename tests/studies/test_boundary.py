@@ -2,6 +2,7 @@
 
 import csv
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from command import magshell, read_path, started
 from conftest import CAP, CASES
+from scipy.optimize import brentq
+from scipy.special import jv, jvp
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
@@ -102,6 +105,18 @@ def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
     assert places["turn"] == pytest.approx([2.0], rel=1e-3)
     assert places["meeting"] == pytest.approx(2 * [np.sqrt(5.5)], rel=1e-3)
     assert found.rows[-1]["unstable"] == 0
+
+
+@pytest.mark.slow
+def test_a_mode_has_one_name_in_both_files(tmp_path: Path) -> None:
+    """A high arch buckles to one side: path.csv of its half and boundary.csv, on the whole, call it antisymmetric."""
+    setting = f"{KEY}=2.6"
+    run = magshell("run", ARCH, "--set", setting, "--out", tmp_path / "run", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    first = next(row for row in read_path(tmp_path / "run") if row["label"] == "bifurcation")
+    found = ms.boundary(ARCH, f"{KEY}=2.59:2.6:1", [setting], tmp_path / "b")
+    assert {row["mode"] for row in found.rows} == {first["mode"]} == {"antisymmetric"}
+    assert found.content["mode"] == "antisymmetric"
 
 
 @pytest.mark.slow
@@ -357,6 +372,50 @@ def test_the_number_of_waves_changes_with_the_thickness(tmp_path: Path) -> None:
     assert [row["mode"] for row in found.rows if row["kind"] == "crossing"] == ["m = 3, m = 4"]
     assert (found.rows[0]["mode"], found.rows[-1]["mode"]) == ("m = 4", "m = 3")
     assert (keys[0], keys[-1]) == (0.0094, 0.0104)
+
+
+def neutral_compression(stiffness: float, m: int) -> float:
+    """N R²/D at which a clamped plate on a foundation k R⁴/D is neutral against m waves.
+
+    Its deflection is A J_m(a r) + B J_m(b r) with a² + b² = N R²/D and a² b² = k R⁴/D.
+    """
+
+    def clamped(N: float) -> float:
+        gap = np.sqrt(N**2 / 4 - stiffness)
+        a, b = np.sqrt(N / 2 + gap), np.sqrt(N / 2 - gap)
+        return float((a * jvp(m, a) * jv(m, b) - b * jv(m, a) * jvp(m, b)) / gap)
+
+    lowest = 2 * np.sqrt(stiffness) * (1 + 1e-9)
+    tried = np.linspace(lowest, lowest + 60, 600)[1:]
+    low, high = next(pair for pair in pairwise(tried) if clamped(pair[0]) * clamped(pair[1]) < 0)
+    return float(brentq(clamped, low, high))
+
+
+@pytest.mark.slow
+def test_where_three_modes_meet_the_first_is_followed(tmp_path: Path) -> None:
+    """A clamped plate that grows on a foundation, by its Bessel functions: m = 1 up to k R⁴/D = 722.62, then m = 0.
+
+    There m = 2 is neutral at the same load, and beyond it comes later than m = 0, by 1 % at 1100.
+    """
+    thinness, nu, growth = 200, 0.3, 1e-3
+    D, case = thinness**-3 / (12 * (1 - nu**2)), tmp_path / "plate.yaml"
+    case.write_text(
+        f"shell: {{geometry: disc, radius_to_thickness: {thinness}, poisson_ratio: {nu}}}\n"
+        f"boundary: {{rim: clamped}}\nfoundation: {{stiffness: {700 * D!r}}}\nnatural: {{stretch: {1 + growth}}}\n"
+        "loading: {kind: natural, grows: stretch, until: limit}\n"
+    )
+    found = ms.boundary(case, f"foundation.stiffness={650 * D!r}:{1100 * D!r}:4", out=tmp_path / "b")
+    assert not found.stopped
+    assert {row["unstable"] for row in found.rows} == {0}
+    meeting = brentq(lambda k: neutral_compression(k, 1) - neutral_compression(k, 2), 650, 800)
+    met = [row["key"] / D for row in found.special]
+    assert met[0] == pytest.approx(meeting, abs=0.1)
+    assert met[-1] < meeting + 3  # the discrete modes 0 and 2 may come in another order so near
+    for row in found.rows:
+        k = row["key"] / D
+        N = 12 * (1 + nu) * thinness**2 * growth * row["load"]  # of a plate that cannot grow at its rim
+        assert pytest.approx(min(neutral_compression(k, m) for m in range(4)), rel=5e-4) == N
+        assert met[0] <= k <= met[-1] or row["mode"] == ("m = 1" if k < met[0] else "")
 
 
 def _numbers(rows: list[dict[str, str]]) -> list[dict[str, Any]]:

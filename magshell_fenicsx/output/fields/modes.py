@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.output.fields.gathering import Gatherer
+from magshell_fenicsx.output.fields.ring import waves_around
 from magshell_fenicsx.output.fields.surface import Surface, turned, whole
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
@@ -29,8 +30,6 @@ if TYPE_CHECKING:  # one of them is built
 
 Array = NDArray[np.float64]
 WAVES = "m = "
-RING, MOST_WAVES = 0.02, 80  # half height over R of the ring of nodes on which waves are counted; largest number
-GAP = np.pi / 4  # largest gap between the nodes of the ring
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
@@ -167,27 +166,12 @@ def _revolved_wave(model: "MeridianModel", u: Vector, m: int, vector: Vector) ->
 
 
 def wave_number(surface: Surface) -> int | None:
-    """The number m >= 2 of waves of a mode around e3, on the ring where the mode is largest.
+    """The number m >= 2 of waves of a mode around e3, see `ring.waves_around`.
 
-    None if no single m >= 2 dominates, if the surface is flat, or if the ring is not closed around e3.
+    None also if the mesh does not resolve them.
     """
-    w, height = surface.fields["mode_w"], surface.r0[:, 2]
-    if np.ptp(height) < RING:
-        return None
-    ring = np.abs(height - height[np.argmax(np.abs(w))]) < RING
-    theta = np.arctan2(surface.r0[ring, 1], surface.r0[ring, 0])
-    order = np.argsort(theta)
-    theta, w = theta[order], w[ring][order]
-    ahead = np.diff(theta, append=theta[0] + 2 * np.pi)
-    if ahead.max() > GAP:
-        return None
-    share = np.sqrt((ahead + np.roll(ahead, 1)) / 2)  # of the ring: where elements are small there are many nodes
-    left = []
-    for m in range(MOST_WAVES + 1):
-        basis = share[:, None] * np.column_stack([np.cos(m * theta), np.sin(m * theta)])
-        left.append(float(np.sum((share * w - basis @ np.linalg.lstsq(basis, share * w)[0]) ** 2)))
-    best = int(np.argmin(left))
-    return best if best >= 2 and left[best] < 0.1 * float(np.sum((share * w) ** 2)) else None
+    waves = waves_around(surface)
+    return waves.number if waves and waves.resolved else None
 
 
 PREFIX = "gradients_"

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.tessellation import Tessellation
 from magshell_fenicsx.output.pictures.view import (
     Camera,
     Image,
     InView,
-    Tessellation,
     Window,
     in_pixels,
     near_outlines,

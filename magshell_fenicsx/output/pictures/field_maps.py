@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.tessellation import tessellated
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, columns, drawing
 from magshell_fenicsx.output.pictures.readings import unit_of
 from magshell_fenicsx.output.pictures.scales import number_format
-from magshell_fenicsx.output.pictures.view import tessellated
 from magshell_fenicsx.parts.seen import MapGrid
 from magshell_fenicsx.problem.wanted import OutputSection
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import SHELL, Surface
+from magshell_fenicsx.output.fields.tessellation import tessellated
 from magshell_fenicsx.output.pictures.beside import Beside, bare_outlines, far_said, near_places
 from magshell_fenicsx.output.pictures.colours import (
     Coloured,
@@ -22,7 +23,7 @@ from magshell_fenicsx.output.pictures.colours import (
 )
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel, columns, drawing, panel_width, panels_figure
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
-from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window, tessellated
+from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window
 from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import

@@ -18,11 +18,12 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
+from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellated
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named, of_load
 from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, from_zero
-from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, near_solids, run_camera, tessellated
+from magshell_fenicsx.output.pictures.view import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
 from magshell_fenicsx.platform.kept import keep, recall
