@@ -220,6 +220,10 @@ class Step(Section):
         """The line of `magshell check`, if nothing else says it."""
         return ""
 
+    def warning(self, step: ProgrammeStep) -> str | None:
+        """What is often meant in another way, with the key; None if nothing is."""
+        return None
+
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""
         return []
