@@ -99,6 +99,11 @@ class Step(Section):
         return None
 
     @property
+    def bound(self) -> tuple[Target, float] | None:
+        """Where a way to the first instability ends at the latest, as `target`; None without."""
+        return None
+
+    @property
     def ends(self) -> Until:
         """Where it ends, in the words of a path."""
         return "target"

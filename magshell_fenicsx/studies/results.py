@@ -78,6 +78,11 @@ def parse_scalar(text: str) -> Scalar:
         return Scalar(text)
     column, _, place = text.partition("@")
     at, _, number = place.partition("=")
+    if re.fullmatch(r"(omega2|hertz)_\d+", column):
+        raise CaseError(
+            f"--result {text}: {column} is a natural frequency, which path.csv has not: runs with "
+            "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients take it as a result"
+        )
     for name in (column, at) if place != "end" else (column,):
         if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
             raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")

@@ -134,5 +134,5 @@ def test_messages() -> None:
         MeshError, match=r"joints.0.edges: the edge web_right is not on the mid-surface of base, by 0.01 R"
     ):
         Scene(Case.from_source(pushed({}, off=0.01)))
-    with pytest.raises(MeshError, match=r"joints.0.edges: web_rim: is no edge; an edge stands first"):
+    with pytest.raises(MeshError, match=r"joints.0.edges: web.rim: is no edge; an edge stands first"):
         Scene(Case.from_source(pushed({}) | {"joints": [{"edges": ["web.rim", "base"]}]}))
