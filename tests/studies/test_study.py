@@ -83,7 +83,7 @@ def test_results_of_the_summary() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("k_d", "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, COLUMN@"),
+        ("k_d", "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, snap_dep"),
         ("force", "nothing is no column"),
         ("force@w=1", "w is no column"),
         ("label@end", "label is no column"),
