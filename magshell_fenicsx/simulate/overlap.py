@@ -1,4 +1,7 @@
-"""Shells that overlap undeformed, without the equations of a scene, which refuses them in the same words."""
+"""Shells that overlap undeformed, and edges that are not on the shell that they join.
+
+They are found without the equations of a scene, which refuses them in the same words.
+"""
 
 from dataclasses import replace
 
@@ -9,13 +12,16 @@ from magshell_fenicsx.models.carriers import on_meridian, on_surface
 from magshell_fenicsx.models.shell.patterns import carried, cells_of
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.tee import refuse_misplaced_feet, refuse_misplaced_rings
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
 MOST = 20_000  # cells in which they are looked for: some seconds
 
 
 def refuse_overlap(problem: Problem, cells: int) -> None:
-    """See that no shells that may touch overlap; of those that get thinner, and of images of a half, a scene does.
+    """See that no shells that may touch overlap, and that edges of T-junctions are on their shells.
+
+    Of shells that get thinner, and of images of a half, a scene does.
 
     Raises
     ------
@@ -23,7 +29,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         With the shells, by how much, and where.
     """
     pairs, h, given = problem.loads.pairs, problem.material.h, problem.thickness
-    if not pairs or cells > MOST:
+    if not (pairs or problem.loads.joints) or cells > MOST:
         return
     if problem.axisymmetric:
         from magshell_fenicsx.parts.touching import on_meridian as curves
@@ -31,6 +37,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
+        refuse_misplaced_rings(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(given, r0, meridian.patches) if given else None
         curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness)
         return
@@ -39,6 +46,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
     r0 = surface.placement(V)
+    refuse_misplaced_feet(problem.loads.joints, surface, r0, h)
     if given and given.given:
         given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
     thickness = thickness_field(given, r0, surface.patches) if given else None
