@@ -82,7 +82,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
             if step.load.bound and not unstable:
-                remark(f"{where}until: limit: there is no instability up to the target")
+                remark(f"{where}there is no instability up to the target, where until: limit ends too")
             release = step.load.released_by
             if release and record and step.until == "bifurcation" and last == "bifurcation":
                 record = departure_of(scene, step, record).record(0)

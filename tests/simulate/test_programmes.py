@@ -232,7 +232,7 @@ def test_first_instability_on_the_way_to_a_target() -> None:
     said = list[str]()
     *_, last = follow(Scene(near), remark=said.append)
     assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
-    assert said == ["step 1 of 1 (field): until: limit: there is no instability up to the target"]
+    assert said == ["step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"]
 
 
 @pytest.mark.parametrize(
