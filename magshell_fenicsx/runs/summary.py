@@ -64,7 +64,9 @@ def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
 
 
 def _first_at(part: float, times: Array, way: Array) -> float:
-    """Return the first time at which a part of a way is done, by cubic interpolation between times."""
+    """Return the first time at which a part of a way is done, by cubic interpolation; the last if it is not by then."""
+    if not (way >= part).any():  # a creeping shell is put to rest from afar
+        return float(times[-1])
     at = int(np.argmax(way >= part))
     passed = scipy.interpolate.CubicSpline(times, way - part)
     return float(scipy.optimize.brentq(passed, times[at - 1], times[at], xtol=1e-12 * times[at]))
