@@ -12,10 +12,12 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from dolfinx import fem, mesh
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.messages import refuse_unknown, unknown
+from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.given import Home, Part
 from magshell_fenicsx.mesh.patch import GivenField
@@ -28,6 +30,8 @@ from magshell_fenicsx.shape.sections import ShellSection, Surface
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is in another unit than metres
+THICKEST, THINNEST = 3.0, 1e4  # extents of a mesh over the thickness that metres may have if nothing says so
 MESH = "the mesh"  # the same, of a mesh
 SHAPES: Mapping[str, type[BaseModel]] = {  # geometry -> its section
     geometry: section
@@ -51,20 +55,22 @@ class Shell:
     radius
         The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
     unit
-        Of a mesh: the unit of its coordinates where the thickness has one; by default the metre.
+        Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default the metre, which
+        is refused where bounds, radius and thickness say otherwise: give "m" where it is right.
     name, place, points, mesh, remanent
         Of one of several shells: the name before its edges and points, `upper.rim`; and where it is, its named points,
         its elements (`{"size": "2 mm"}`) and its remanence, as a case has them under `shells`.
     keys
         What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
-        `thickness_factor`, a formula of the place over R or a function, is that of each place.
+        `thickness_factor`, a formula of the place x, y, z over R or a function, is that of each place. A function is
+        interpolated with x in the coordinates of the mesh, in mm for instance; a formula never has these.
 
     Raises
     ------
     MeshError
         On every rank, if the mesh is of another kind, or tags are missing.
     CaseError
-        If a geometry or a key is none that a shell has.
+        If a geometry or a key is none that a shell has, or `unit` seems to be forgotten.
     """
 
     def __init__(
@@ -108,8 +114,11 @@ class Shell:
         measured = isinstance(keys.get("thickness"), str)
         if measured or unit is not None:
             self._keys["unit"] = unit or "m"
+        extents = np.ptp(triangles.nodes, axis=0)
+        if measured and unit is None:
+            _refuse_metres(extents, radius, keys["thickness"])
         if radius is None:
-            half = float(np.ptp(triangles.nodes, axis=0).max()) / 2
+            half = float(extents.max()) / 2
             self._keys["radius"] = f"{half!r} {unit or 'm'}" if measured else half
 
     def one_of_several(self) -> Keys:
@@ -245,7 +254,10 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
     ----------
     remanent, applied
         A vector of three numbers or formulas, of the remanence too a function on the mesh or its kind in a case, such
-        as "radial"; or all its keys in a case.
+        as "radial"; or all its keys in a case. In formulas x, y, z are the place over R, the `radius` of the shell, and
+        never the coordinates of the mesh: of the remanence the undeformed place, of the applied field the deformed one.
+        A function on the mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
+        `interpolate(lambda x: np.sin(np.pi * x[0] / 80))` on a mesh in mm.
     keys
         What else a case has under `magnetic`.
     """
@@ -260,6 +272,44 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
         return both | others | ({"lambda_m": shell.plain(lambda_m, "magnetic.lambda_m")} if dimensionless else {})
 
     return Piece("magnetic", made)
+
+
+def _refuse_metres(extents: NDArray[np.float64], radius: float | str | None, thickness: str) -> None:
+    """See that the bounds of a mesh without a unit are those of a shell in metres.
+
+    Parameters
+    ----------
+    extents
+        (3,) of the mesh along its axes.
+    radius, thickness
+        As they were given.
+
+    Raises
+    ------
+    CaseError
+        If they are far from the radius, or from what a thickness goes with.
+    """
+    extent = float(extents.max())
+    metres = [_in_metres(length) for length in (radius, thickness)]
+    bounds = " x ".join(f"{each:.4g}" for each in extents)
+    if metres[0] and not 1 / FAR_FROM_ONE <= extent / metres[0] <= FAR_FROM_ONE:
+        raise CaseError(
+            f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, {extent / metres[0]:.4g} times as long as "
+            f'radius, {radius}: give unit="mm", for instance, or unit="m" if that is right'
+        )
+    if metres[1] and not THICKEST <= extent / metres[1] <= THINNEST:
+        raise CaseError(
+            f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, {extent / metres[1]:.4g} times as long as "
+            f'thickness, {thickness}: give unit="mm", for instance, or unit="m" if that is right'
+        )
+
+
+def _in_metres(length: Any) -> float | None:
+    """A length that was given; None if it is none, which is refused elsewhere."""
+    try:
+        return float(in_units("metre")(length)) or None
+    except (TypeError, ValueError):
+        return None
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:

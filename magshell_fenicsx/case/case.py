@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -20,7 +20,7 @@ from pydantic import (
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
 from magshell_fenicsx.case.merged import expanded, written
-from magshell_fenicsx.case.shells import Part, Several, Shells
+from magshell_fenicsx.case.shells import Part, Several, Shells, in_words_of_shells
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, Later, digests, numbers_with_units
 from magshell_fenicsx.input.source import Source, read_source
@@ -296,6 +296,9 @@ class Case(WithParts):
         sections |= self.several.readers if self.several else {}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
+    def placed(self, message: str) -> str:
+        return super().placed(in_words_of_shells(message, self.origin.data))
+
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":
         """Read a case file, with `key.path=value` settings in place of its own.
@@ -323,4 +326,4 @@ class Case(WithParts):
             case = cls.model_validate(source.data, context=context)
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
-            raise InvalidCase(e.errors(), source, cls) from None
+            raise InvalidCase(e.errors(), source, cls, partial(in_words_of_shells, data=source.data)) from None

@@ -86,7 +86,7 @@ def _described(case: Case, problem: Problem) -> str:
         missed = unshown(
             formulas, cells_of_patch(patch, degree_of(problem.context)), problem.azimuth, problem.material.h
         )
-    lines += [f"warning: {said}" for said in (problem.warning, too_large, *missed) if said]
+    lines += [f"warning: {said}" for said in (*problem.warnings, too_large, *missed) if said]
     return "\n".join(lines)
 
 

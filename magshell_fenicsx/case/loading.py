@@ -61,7 +61,8 @@ def refuse_unfit_steps(context: Context) -> None:
     for step in context.steps:
         load, key = step.load, step.key
         load.refuse_unfit(step, context)
-        if step.name not in context.driven_before(step.number) and load.target and load.target[1] == 0:
+        goal = load.target or load.bound
+        if step.name not in context.driven_before(step.number) and goal and goal[1] == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
                 "begins there"
@@ -84,6 +85,8 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         key = f"{step.key}.hold.{name}"
         if name == step.name and not (limit and how == "conjugate"):
             raise ValueError(f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}")
+        if name == step.name and step.load.bound:
+            raise ValueError(f"{key}: conjugate: the way to the instability has no end: leave out the target")
         if name not in loads:
             raise ValueError(f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}")
         load = loads[name]

@@ -6,7 +6,8 @@ one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Keys = dict[str, Any]
+EDGE_NAMES = (  # of all geometries but mesh files
+    *("equator", "rim", "hole", "inner", "outer", "left", "right", "bottom", "top", "root", "tip", "sides"),
+)
 
 
 class PlaceSection(Section):
@@ -86,6 +90,43 @@ class OneOfShells(Section):
 
 
 Shells = Annotated[dict[str, OneOfShells], Field(min_length=1, max_length=50)]
+
+
+def in_words_of_shells(message: str, data: Any) -> str:
+    """Return a message with the names of the case file: `upper.rim` in place of `upper_rim`, which stands for it.
+
+    Parameters
+    ----------
+    data
+        Plain data of a case. Edges and points that it names, and edges of all geometries, are known.
+
+    Examples
+    --------
+    >>> in_words_of_shells("boundary.a_rim: is joined; its edges: a_top, a_tip_uz", {"shells": {"a": {}}})
+    'shells.a.boundary.rim: is joined; its edges: a.top, a_tip_uz'
+    """
+    shells = data.get("shells") if isinstance(data, Mapping) else None
+    if not isinstance(shells, Mapping):
+        return message
+    texts = {*_texts(data)}
+    for name in map(str, shells):
+        named = {text.removeprefix(f"{name}.") for text in texts if re.fullmatch(rf"{re.escape(name)}\.\w+", text)}
+        members = "|".join(sorted({*EDGE_NAMES, *named, *filter(str.isidentifier, _texts(shells[name]))}))
+        shell = re.escape(name)
+        message = re.sub(rf"\b(boundary|points)\.({shell})_({members})\b", r"shells.\2.\1.\3", message)
+        message = re.sub(rf"(?<![\w./])({shell})_({members})\b(?!\.\w)", r"\1.\2", message)
+    return message
+
+
+def _texts(data: Any) -> Iterator[str]:
+    """All keys and texts of plain data."""
+    if isinstance(data, Mapping):
+        for key, value in data.items():
+            yield from (str(key), *_texts(value))
+    elif isinstance(data, list | tuple):
+        yield from (text for each in data for text in _texts(each))
+    elif isinstance(data, str):
+        yield data
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any, get_args, get_origin
 
@@ -54,16 +54,28 @@ def _classes(module: str) -> dict[str, ast.ClassDef]:
 
 
 class InvalidCase(CaseError):
-    """A case that its sections refuse: one line for each mistake."""
+    """A case that its sections refuse: one line for each mistake.
 
-    def __init__(self, errors: Sequence[Any], source: Source, case: type[BaseModel]) -> None:
-        super().__init__(explained(errors, source, case))
-        self._errors, self._source, self._case = errors, source, case
+    Parameters
+    ----------
+    in_words
+        Puts the names of the case file into a message.
+    """
+
+    def __init__(
+        self,
+        errors: Sequence[Any],
+        source: Source,
+        case: type[BaseModel],
+        in_words: Callable[[str], str] = str,
+    ) -> None:
+        super().__init__(in_words(explained(errors, source, case)))
+        self._errors, self._source, self._case, self._in_words = errors, source, case, in_words
 
     def of(self, *kinds: str) -> list[str]:
         """The lines of pydantic's errors of some kinds."""
         errors = [error for error in self._errors if error["type"] in kinds]
-        return [explained(errors, self._source, self._case)] if errors else []
+        return [self._in_words(explained(errors, self._source, self._case))] if errors else []
 
     def __reduce__(self) -> tuple[type[CaseError], tuple[str]]:
         return CaseError, (str(self),)  # for other ranks the message is enough

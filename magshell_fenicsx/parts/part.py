@@ -150,7 +150,8 @@ class Context:
         """
         edge = self.shell.edge_polar
         if edge is not None and not 0 <= polar < edge - 1:
-            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
+            least = getattr(self.shell, "hole", None) or 0
+            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed {least:g} to {edge - 1:g}")
 
     @property
     def scales(self) -> Scales:

@@ -65,7 +65,8 @@ class PathStep(Step):
         if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
             return data
         quantities = {each.quantity for key, each in cls.targets.items() if data.get(key) is not None}
-        return {**data, "control": "load"} if quantities == {"load"} else data
+        way = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
+        return {**data, "control": way} if quantities == {"load"} else data
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
@@ -84,8 +85,12 @@ class PathStep(Step):
         onward = self.until == "bifurcation" and self.then == "follow"
         if onward and len(given) > 1:
             raise ValueError(f"{' and '.join(given)}: a branch has one target")
-        if self.until in ("limit", "bifurcation", "zero") and given and not onward:
+        if self.until == "zero" and given:
             raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
+        if self.until == "bifurcation" and given and not onward:
+            raise ValueError(f"{next(iter(given))} is a target: it goes with until: target or limit")
+        if self.until == "limit" and given:
+            self._refuse_unfit_bound(list(given), fitting)
         if self.until in ("points", "zero") and by != "arc":
             why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
@@ -96,6 +101,18 @@ class PathStep(Step):
         if self.snap != SnapSection() and self.then != "snap":
             raise ValueError("snap: goes with then: snap")
         return self
+
+    def _refuse_unfit_bound(self, given: list[str], fitting: list[str]) -> None:
+        """See that a target is the end of a way on which the first instability is looked for."""
+        if "until" not in self.model_fields_set:
+            raise ValueError(
+                f"{given[0]} is a target: it goes with until: target; or write until: limit, for the first instability "
+                "on the way there"
+            )
+        if len(given) > 1 or self.prescribed == "load" or given[0] not in fitting:
+            raise ValueError(
+                f"{' and '.join(given)}: beside until: limit stands one target, the end of the way, with control: arc"
+            )
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
@@ -135,11 +152,20 @@ class PathStep(Step):
 
     @property
     def target(self) -> tuple[Target, float] | None:
+        if self.bound:
+            return None
         for key, value in self._given.items():
             return self.targets[key], value
         if self._end is None or self.until != "target":
             return None
         return next(iter(self.targets.values())), self._end
+
+    @property
+    def bound(self) -> tuple[Target, float] | None:
+        """With `until: limit`: where the way ends at the latest, and its direction; None without."""
+        if self.until != "limit":
+            return None
+        return next(((self.targets[key], value) for key, value in self._given.items()), None)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         """Change of the amplitude in the first step, by default one of equal parts; its sign is that of `change`.
@@ -163,14 +189,14 @@ class PathStep(Step):
         Targets are equal parts of the way: from zero if the amplitude is driven for the first time, without those
         that earlier steps have passed.
         """
-        goal = self.target
+        goal = self.target or self.bound
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
         begin_value = now.value if by_load else now.conjugate
         end = None if goal is None else goal[1] * (now.size if by_load else now.unit)
         change = now.size if end is None else end - begin_value
         targets: list[float] = []
-        if end is not None and self.until == "target":
+        if end is not None and (self.until == "target" or self.bound):
             begin = begin_value if now.driven else self.begin(begin_value)
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
@@ -221,10 +247,11 @@ class BodyForceStep(LoadStep):
     """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if self.target else now.h**2
+        return change / self.points if self.target or self.bound else now.h**2
 
     def scale(self, now: Now) -> float:
-        return abs(self.target[1]) or now.h**2 if self.target else now.h**2
+        goal = self.target or self.bound
+        return abs(goal[1]) or now.h**2 if goal else now.h**2
 
 
 class FactorStep(LoadStep):

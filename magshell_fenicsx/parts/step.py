@@ -99,6 +99,11 @@ class Step(Section):
         return None
 
     @property
+    def bound(self) -> tuple[Target, float] | None:
+        """Where a way to the first instability ends at the latest, as `target`; None without."""
+        return None
+
+    @property
     def ends(self) -> Until:
         """Where it ends, in the words of a path."""
         return "target"
@@ -219,6 +224,10 @@ class Step(Section):
     def account(self, step: ProgrammeStep, context: Context) -> str:
         """The line of `magshell check`, if nothing else says it."""
         return ""
+
+    def warning(self, step: ProgrammeStep) -> str | None:
+        """What is often meant in another way, with the key; None if nothing is."""
+        return None
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""

@@ -154,8 +154,8 @@ class Problem:
         R in the unit of results: metres of a case with units, else the unit of its lengths.
     pressed
         Size of each body, and how far from its first contact it presses; over R.
-    warning
-        What is unphysical, if anything.
+    warnings
+        What is unphysical, or often meant in another way.
     within
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     lambda_m
@@ -198,7 +198,7 @@ class Problem:
     pressed: tuple[tuple[float, float], ...] = ()
     supports: tuple[str, ...] = ()
     reactions: bool = False
-    warning: str | None = None
+    warnings: tuple[str, ...] = ()
     within: Mapping[str, Inside] = field(default_factory=dict)
     lambda_m: float = 0.0
     unknowns: float = 0.0

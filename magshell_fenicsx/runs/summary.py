@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.factor import Stopwatch
@@ -16,7 +17,7 @@ from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shape.sections import ShellSection, Surface
 from magshell_fenicsx.shells.modes import ShellMode
@@ -27,12 +28,18 @@ from magshell_fenicsx.simulate.scene import Scene
 if TYPE_CHECKING:
     from magshell_fenicsx.simulate.adapt.choice import Adapted
 
+Array = NDArray[np.float64]
+
+BEGUN, DONE = 0.1, 0.9  # of the way of a snap: between them it jumps
+
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The motions that begin at a fold and end at rest (`then: snap`).
+    """Return the motions that begin at a fold and end at rest (`then: snap`).
 
-    `time` is from the release until the deflection is half way, in the unit of the column time; `overshoot` the largest
-    deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
+    `time` is from the release until the deflection is half way, in the unit of the column time; `departure` until it
+    has done a tenth of the way, which grows without limit as the push at the fold vanishes; `jump` from there until it
+    has done nine tenths. `overshoot` is the largest deflection beyond the last, over the way; `dissipated` the energy
+    over E h R^2.
     """
     at_rest = []
     for i, fold in ((i, row) for i, row in enumerate(rows[:-1]) if row["label"] == "fold"):
@@ -43,14 +50,26 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
             continue
         t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
         way = (w - w[0]) / (w[-1] - w[0])
-        at = int(np.argmax(way >= 0.5))
-        past_half = scipy.interpolate.CubicSpline(t[:-1], way[:-1] - 0.5)  # the last two rows are of one time
-        half = float(scipy.optimize.brentq(past_half, t[at - 1], t[at], xtol=1e-12 * t[at])) - t[0]
+        # the last two rows are of one time
+        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (BEGUN, 0.5, DONE))
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
-        at_rest.append(
-            {**ends, "time": half, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])}
-        )
+        times = {"time": half, "departure": begun, "jump": done - begun}
+        at_rest.append({**ends, **times, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
     return at_rest
+
+
+def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
+    """Return the times of a snap of a case with units."""
+    return {f"snap_{key}_ms": 1e3 * snap[key] * sizes.size("time") for key in ("time", "departure", "jump")}
+
+
+def _first_at(part: float, times: Array, way: Array) -> float:
+    """Return the first time at which a part of a way is done, by cubic interpolation; the last if it is not by then."""
+    if not (way >= part).any():  # a creeping shell is put to rest from afar
+        return float(times[-1])
+    at = int(np.argmax(way >= part))
+    passed = scipy.interpolate.CubicSpline(times, way - part)
+    return float(scipy.optimize.brentq(passed, times[at - 1], times[at], xtol=1e-12 * times[at]))
 
 
 @dataclass
@@ -234,7 +253,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "critical_field": result.critical_field,
         "barrier": result.barrier,
         "snaps": snapped,
-        **({"snap_time_ms": 1e3 * snapped[0]["time"] * sizes.size("time")} if snapped and sizes.unit("time") else {}),
+        **(_in_milliseconds(snapped[0], sizes) if snapped and sizes.unit("time") else {}),
         **{
             key: said
             for room in SEEN

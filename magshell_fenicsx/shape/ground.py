@@ -67,6 +67,10 @@ class Ground:
         Whether lengths of the case are in metres.
     edge_polar
         Of a part of a sphere the angle of its edge from e3 (degree); None of other geometries.
+    hole_polar
+        Of a part of a sphere the angle of its hole's edge from e3 (degree); 0 without a hole.
+    azimuths
+        First and last azimuth (degree) of a part of a surface of revolution; None all around.
     thickness_factor
         A formula that multiplies the thickness.
     identity
@@ -86,6 +90,8 @@ class Ground:
     thickness_factor: str | None = None
     identity: tuple[str | None, ...] = ()
     turn: float = 0.0
+    hole_polar: float = 0.0
+    azimuths: tuple[float, float] | None = None
 
     @property
     def h(self) -> float:
@@ -150,7 +156,7 @@ def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
     elif ground.spherical:
         place = at.vector()
         if not 0 <= at.polar <= 180 or np.linalg.norm(perfect.perfect(perfect.inverse(place)[None])[0] - place) > 1e-6:
-            raise CaseError(f"{key}.at.polar: {at.polar:g}: is not on the shell: allowed 0 to {ground.edge_polar:g}")
+            raise CaseError(f"{key}.at{_off_shell(at, ground)}")
     elif at.polar or perfect.highest is None or not (perfect.disc or ground.geometry == "strip"):
         raise CaseError(f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}")
     else:
@@ -160,6 +166,18 @@ def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
     if perfect.from_pole and np.hypot(*place[:2]) < ON_AXIS:
         return place, perfect.from_pole
     return place, Straight(place)
+
+
+def _off_shell(at: At, ground: Ground) -> str:
+    """Why a direction from the centre of a sphere is not on the part that there is, after the key `at`."""
+    hole, edge = ground.hole_polar, ground.edge_polar or 0.0
+    if hole and "polar" not in at.model_fields_set:
+        return f": is not given, and the pole is in the hole of the shell: give polar, {hole:g} to {edge:g}"
+    if hole <= at.polar <= edge and ground.azimuths:
+        first, last = ground.azimuths
+        return f".azimuth: {at.azimuth:g}: is not on the shell: allowed {first:g} to {last:g}"
+    beside = f", beside its hole of {hole:g} degrees" if at.polar < hole else ""
+    return f".polar: {at.polar:g}: is not on the shell: allowed {hole:g} to {edge:g}{beside}"
 
 
 def refuse_beside(key: str, x: Array, outline: "Outline", R: float, *, with_units: bool) -> None:

@@ -188,6 +188,8 @@ def ground_of(shell: Surface | ShellSection) -> Ground:
         shell.edge_polar,
         factor if isinstance(factor, str) else None,
         (shell.model_dump_json(exclude={"imperfections"}), shell.digest if isinstance(shell, MeshSurface) else None),
+        hole_polar=getattr(shell, "hole", None) or 0.0,
+        azimuths=(azimuth[0], azimuth[1]) if (azimuth := getattr(shell, "azimuth", None)) else None,
     )
 
 

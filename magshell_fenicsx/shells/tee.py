@@ -8,8 +8,9 @@ cell and m of the other shell, t along the edge, s = t . (n x m) and c = n . m:
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
 """
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import basix
 import numpy as np
@@ -24,7 +25,9 @@ from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values, whole_hessian
+from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError, place_text
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.parts.touching.nearest import Cells, places_near
@@ -191,51 +194,135 @@ class Tee(Tie):
         material: Material,
         log: KernelLog,
     ) -> None:
-        V = r0.function_space
-        self._of_all, self._r0, self._element = CellsOfAll.of(V), whole(r0), V.element.basix_element
-        first = self._of_all.own.start
-        cells, ends = _sides(V, foot, len(self._of_all.own))
-        s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
-        X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
-        along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
-        cell = np.repeat(first + cells, len(s))
-        on_edge = self._shapes(X.reshape(-1, 2))
-        nodes = self._of_all.nodes
-        x = np.einsum("nk,nki->ni", on_edge[0], self._r0[nodes[cell]])
-        tangent = np.einsum("na,ank,nki->ni", along, on_edge[1:], self._r0[nodes[cell]])
-        weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
-        length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
-        other, Y, apart = self._places(x, np.flatnonzero(self._of_all.gathered(on)))
-        _refuse_apart(V.mesh.comm, apart, x, material.h, key, joint)
-        on_other = self._shapes(Y)
-        both = np.concatenate([nodes[cell], nodes[other]], axis=1)
-        of_cells = self._of_all.gathered(stiffness)
+        surfaces = Surfaces.of(r0)
+        at = surfaces.foot(foot, on)
+        at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
+        nodes = surfaces.cells.nodes
+        both = np.concatenate([nodes[at.cell], nodes[at.other]], axis=1)
+        of_cells = surfaces.cells.gathered(stiffness)
         half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
-        D = np.zeros((len(x), 4, both.shape[1]))
-        D[:, :2, :half], D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (on_edge, on_other))
-        beta = np.concatenate([on_edge[0], -on_other[0]], axis=1)
+        on_other = surfaces.shapes(at.Y)
+        D = np.zeros((len(at.x), 4, both.shape[1]))
+        D[:, :2, :half], D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (at.on_edge, on_other))
+        beta = np.concatenate([at.on_edge[0], -on_other[0]], axis=1)
         super().__init__(
             joint,
             r0,
             u,
-            (3 * both[:, :, None] + np.arange(3)).reshape(len(x), count),
-            np.einsum("nk,cd->nckd", beta, axes).reshape(len(x), 3, count),
-            np.einsum("nik,cd->nickd", D, axes).reshape(len(x), PARTS, count),
-            along,
-            _stiff(joint, material, np.maximum(of_cells[cell], of_cells[other]), length, weight),
+            (3 * both[:, :, None] + np.arange(3)).reshape(len(at.x), count),
+            np.einsum("nk,cd->nckd", beta, axes).reshape(len(at.x), 3, count),
+            np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), PARTS, count),
+            at.along,
+            _stiff(joint, material, np.maximum(of_cells[at.cell], of_cells[at.other]), at.length, at.weight),
             log,
         )
 
-    def _shapes(self, X: Array) -> Array:
+
+@dataclass(frozen=True)
+class Foot:
+    """Points (n, 3) of an edge, and the places of another shell that are nearest to them.
+
+    Attributes
+    ----------
+    cell, other
+        (n,) global numbers of the cells of both.
+    on_edge
+        (3, n, functions): shape functions of the edge's cells at the points, and their derivatives.
+    x
+        The points, undeformed.
+    along
+        (n, 2) the edge's direction in the coordinates of its cell.
+    weight, length
+        (n,) the length for which a point stands, and that of its cell's side.
+    Y, apart
+        (n, 2) the places in their cells, and (n,) their distances, inf without a cell.
+    within
+        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of these cells.
+    """
+
+    cell: Longs
+    on_edge: Array
+    x: Array
+    along: Array
+    weight: Array
+    length: Array
+    other: Longs
+    Y: Array
+    apart: Array
+    within: float
+
+    def refuse_misplaced(self, comm: MPI.Comm, h: float, key: str, joint: Joint) -> None:
+        """See that the edge is on the other shell, and its own shell is not; collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, with the place and how far it is.
+        """
+        _refuse_apart(comm, self.apart, self.x, h, key, joint)
+        if min(comm.allgather(self.within)) < APART * h:
+            foot, other = joint.edges
+            raise MeshError(
+                f"{key}: the shell of the edge {foot} lies in the mid-surface of {other}, where both take the same "
+                "place: turn it out, or join edges of both"
+            )
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The undeformed mid-surfaces of all shells, whole on every rank.
+
+    Attributes
+    ----------
+    cells
+        Of all ranks.
+    r0
+        (nodes, 3) places.
+    """
+
+    V: fem.FunctionSpace
+    cells: CellsOfAll
+    r0: Array
+
+    @classmethod
+    def of(cls, r0: fem.Function) -> Self:
+        """Those of a placement; collective."""
+        return cls(r0.function_space, CellsOfAll.of(r0.function_space), whole(r0))
+
+    @property
+    def _element(self) -> basix.finite_element.FiniteElement:
+        return self.V.element.basix_element
+
+    def shapes(self, X: Array) -> Array:
         """(3, n, functions): shape functions at places and their derivatives."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
-    def _places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
+    def foot(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> Foot:
+        """The points of an edge on this rank, given by local facets, on the shell of some local cells; collective."""
+        first, nodes = self.cells.own.start, self.cells.nodes
+        cells, ends = _sides(self.V, facets, len(self.cells.own))
+        s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
+        X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
+        along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
+        cell = np.repeat(first + cells, len(s))
+        on_edge = self.shapes(X.reshape(-1, 2))
+        x = np.einsum("nk,nki->ni", on_edge[0], self.r0[nodes[cell]])
+        tangent = np.einsum("na,ank,nki->ni", along, on_edge[1:], self.r0[nodes[cell]])
+        weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
+        length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
+        shell = np.flatnonzero(self.cells.gathered(on))
+        other, Y, apart = self.nearest(x, shell)
+        beside = self.r0[nodes[first + cells]]
+        far = self.nearest(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
+        within = float(far.max(axis=1, initial=0.0).min(initial=np.inf))
+        return Foot(cell, on_edge, x, along, weight, length, other, Y, apart, within)
+
+    def nearest(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance, inf without a cell."""
         from scipy.spatial import cKDTree  # takes long to import
 
         nearest, Y, apart = np.zeros(len(x), dtype=np.int64), np.zeros((len(x), 2)), np.full(len(x), np.inf)
-        nodal = self._r0[self._of_all.nodes[cells]]
+        nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = AROUND * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
         near = cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
@@ -243,9 +330,9 @@ class Tee(Tie):
         which = np.concatenate([np.asarray(numbers, dtype=np.int64) for numbers in (*near, [])])
         if not len(point):
             return nearest, Y, apart
-        surface = Cells(self._element, self._of_all.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
+        surface = Cells(self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
         each = which, np.arange(len(which)), np.ones(len(which), dtype=np.int64), point
-        pair, at = places_near(surface, self._r0, x, each, np.inf)
+        pair, at = places_near(surface, self.r0, x, each, np.inf)
         point, which, foot, distance = at.point, which[pair], at.X, at.distance
         order = np.lexsort((cells[which], np.round(distance, 12), point))  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
@@ -276,19 +363,11 @@ class MeridianTee(Tie):
         log: KernelLog,
     ) -> None:
         V = r0.function_space
-        ends, dofs = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0], V.dofmap.list
-        inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
-        cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
+        ends, dofs = _ends_of_cells(V), V.dofmap.list
+        cells, self._shapes = _rings(V, tied)
         self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
-        self._shapes = []
-        for s, of in zip(tied, cells, strict=True):
-            lengths = (ends[of, 1] - ends[of, 0])[:, None]
-            N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(of)
-            self._shapes.append((N.ravel(), (slopes / lengths).ravel()))
         nodal = r0.x.array.reshape(-1, 2)
-        (rho, z), other = (N @ nodal[dofs[of].ravel()] for (N, _), of in zip(self._shapes, cells, strict=True))
-        apart = np.array([np.hypot(*(other - [rho, z]))])
-        _refuse_apart(V.mesh.comm, apart, np.array([[rho, 0.0, z]]), material.h, key, joint)
+        rho = _refuse_rings_apart(r0, tied, material.h, key, joint)
         foot = int(cells[0][0])
         length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(self._shapes[0][1] @ nodal[dofs[foot]])
         stiff = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
@@ -315,6 +394,46 @@ class MeridianTee(Tie):
             places.append(np.kron(N, value))
             tangents.append(np.vstack([np.kron(along, value), np.kron(N, around)]))
         return np.hstack([places[0], -places[1]])[None], block_diag(*tangents)[None]
+
+
+def _ends_of_cells(V: fem.FunctionSpace) -> Array:
+    """(cells, 2) parameters of the ends of a meridian's cells."""
+    return np.asarray(V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0])
+
+
+def _rings(V: fem.FunctionSpace, tied: tuple[float, float]) -> tuple[list[Longs], list[tuple[Array, Array]]]:
+    """The cells at both parameters of a junction, with their shape functions there and slopes, all in one row."""
+    ends, shapes = _ends_of_cells(V), []
+    inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
+    cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
+    for s, of in zip(tied, cells, strict=True):
+        lengths = (ends[of, 1] - ends[of, 0])[:, None]
+        N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(of)
+        shapes.append((N.ravel(), (slopes / lengths).ravel()))
+    return cells, shapes
+
+
+def _refuse_rings_apart(r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint) -> float:
+    """See that the ring of an edge is on the other shell; its radius."""
+    V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
+    cells, shapes = _rings(V, tied)
+    (rho, z), other = (N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True))
+    apart = np.array([np.hypot(*(other - [rho, z]))])
+    _refuse_apart(V.mesh.comm, apart, np.array([[rho, 0.0, z]]), h, key, joint)
+    return float(rho)
+
+
+def refuse_misplaced_rings(joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float) -> None:
+    """See that the edges of T-junctions are on the other shell, as a model of the meridian does.
+
+    Raises
+    ------
+    MeshError
+        With the edge.
+    """
+    for i, (joint, s, of) in enumerate(zip(joints, meridian.tied, meridian.joints, strict=True)):
+        if of is None:
+            _refuse_rings_apart(r0, s, h, f"joints.{i}.edges", joint)
 
 
 def _entries(unknowns: Longs, H: Array) -> Entries:
@@ -367,12 +486,32 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
-def tees(model: "ShellModel") -> list[Tee]:
-    """The T-junctions of a model; collective."""
-    joints, surface = model.loads.joints, model.midsurface
+def _tied(joints: Sequence[Joint], surface: Midsurface) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
+    """The joints that are T-junctions, with their keys and which cells of this rank the other shell has."""
     pairs = enumerate(zip(joints, surface.joints, strict=True))
     tied = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
-    tied += [(Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items()]
+    return [*tied, *((Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items())]
+
+
+def refuse_misplaced_feet(joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float) -> None:
+    """See that the edges of T-junctions are on the other shell, as a model does; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, with the edge.
+    """
+    tied = _tied(joints, surface)
+    surfaces = Surfaces.of(r0) if tied else None
+    for joint, key, on in tied:
+        assert surfaces
+        surfaces.foot(surface.edges[joint.edges[0]], on).refuse_misplaced(r0.function_space.mesh.comm, h, key, joint)
+
+
+def tees(model: "ShellModel") -> list[Tee]:
+    """The T-junctions of a model; collective."""
+    surface = model.midsurface
+    tied = _tied(model.loads.joints, surface)
     if not tied:
         return []
     edges, factors, log = surface.edges, _factors(model), model.kernels

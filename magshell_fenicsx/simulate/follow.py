@@ -73,12 +73,16 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         scene.progress.beginning(step.number)
         _refuse_not_numbers(scene, state, where)
         walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
+        unstable = False
         try:
             for record in walked:
                 last = record.label
                 yield _recorded(scene, step, record, remark, where)
+                unstable = unstable or last in LOCATED
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
+            if step.load.bound and not unstable:
+                remark(f"{where}there is no instability up to the target, where until: limit ends too")
             release = step.load.released_by
             if release and record and step.until == "bifurcation" and last == "bifurcation":
                 record = departure_of(scene, step, record).record(0)

@@ -1,29 +1,40 @@
-"""Shells that overlap undeformed, without the equations of a scene, which refuses them in the same words."""
+"""Shells that overlap undeformed, and edges that are not on the shell that they join.
+
+They are found without the equations of a scene, which refuses them in the same words.
+"""
 
 from dataclasses import replace
 
+import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
+from magshell_fenicsx.assembly.connected import pieces
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.carriers import on_meridian, on_surface
 from magshell_fenicsx.models.shell.patterns import carried, cells_of
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.tee import Surfaces, refuse_misplaced_feet, refuse_misplaced_rings
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
 MOST = 20_000  # cells in which they are looked for: some seconds
 
 
 def refuse_overlap(problem: Problem, cells: int) -> None:
-    """See that no shells that may touch overlap; of those that get thinner, and of images of a half, a scene does.
+    """See that no shells that may touch overlap, and that edges of T-junctions are on their shells.
+
+    Of shells that get thinner, and of images of a half, a scene does.
 
     Raises
     ------
     MeshError
         With the shells, by how much, and where.
+    CaseError
+        If magnetised parts are in each other.
     """
     pairs, h, given = problem.loads.pairs, problem.material.h, problem.thickness
-    if not pairs or cells > MOST:
+    if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MOST:
         return
     if problem.axisymmetric:
         from magshell_fenicsx.parts.touching import on_meridian as curves
@@ -31,6 +42,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
+        refuse_misplaced_rings(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(given, r0, meridian.patches) if given else None
         curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness)
         return
@@ -39,7 +51,31 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
     r0 = surface.placement(V)
+    refuse_misplaced_feet(problem.loads.joints, surface, r0, h)
+    if problem.loads.interaction:
+        _refuse_parts_in_each_other(r0, h)
     if given and given.given:
         given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
     thickness = thickness_field(given, r0, surface.patches) if given else None
     touchings(pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness)
+
+
+def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
+    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no numbers.
+
+    Raises
+    ------
+    CaseError
+        In the words of a scene, which sees more: parts too near for the size of their cells.
+    """
+    from magshell_fenicsx.parts.magnetism.close import INSIDE
+    from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
+
+    surfaces, V = Surfaces.of(r0), r0.function_space
+    nodes = surfaces.cells.nodes
+    part = pieces(V)[V.dofmap.list[: len(nodes), 0]]
+    for number in np.unique(part)[1:]:
+        own = np.unique(nodes[part == number])
+        others = np.flatnonzero(part < number)
+        if surfaces.nearest(surfaces.r0[own], others)[2].min(initial=np.inf) < INSIDE * h:
+            raise CaseError(TOO_NEAR)

@@ -47,7 +47,21 @@ TRIES = 4  # how often a place between two points comes nearer to one of them be
 ByField = Callable[[FieldGradient], Array]
 
 
-class Outside(Lost):
+class NotRead(Lost):
+    """A place at which there is no equilibrium.
+
+    Attributes
+    ----------
+    place
+        In the unit of readings.
+    """
+
+    def __init__(self, message: str, place: float) -> None:
+        super().__init__(message)
+        self.place = place
+
+
+class Outside(NotRead):
     """A place that the path does not reach."""
 
 
@@ -276,12 +290,12 @@ class Read:
         if k is None:
             reached = f"goes from {min(values):.6g} to {max(values):.6g}" if len(values) > 1 else "has no such point"
             why = f" ({self._lost})" if self._lost else ""
-            raise Outside(f"{places.column} = {place:.6g} is outside the path, which {reached}{why}")
+            raise Outside(f"{places.column} = {place:.6g} is outside the path, which {reached}{why}", place)
         low, high = ((values[i], way[i].point.state) for i in (k, k + 1))
         try:
             state = self._between_states(stage_of(self.scene, places.step, low[1]), low, high, place)
         except Lost as e:
-            raise Lost(f"no equilibrium is found at {places.column} = {place:.6g}: {e}") from None
+            raise NotRead(f"no equilibrium is found at {places.column} = {place:.6g}: {e}", place) from None
         point = Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0)
         return Record("target", places.name, point, step=places.step.number)
 

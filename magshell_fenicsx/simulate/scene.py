@@ -149,7 +149,7 @@ class Scene:
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
             )
         self.problem, self.comm = problem, comm
-        self.warnings = [said for said in (self.problem.warning, _beyond_memory(self.problem, comm)) if said]
+        self.warnings = [said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:
             self.model = build_meridian_model(self.problem)

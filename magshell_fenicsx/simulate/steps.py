@@ -58,7 +58,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     for finer in (course.finer, along_contact if scene.model.touchings else None):
         path = path.in_steps(finer(path.options)) if finer else path
-    if drive.end is not None and not drive.targets and course.until == "target":  # it is there
+    if drive.end is not None and not drive.targets and (course.until == "target" or load.bound):  # it is there
         yield Record("target", step.name, stage.point(start))
         return state
     goal = Goal(course.until, drive.targets, drive.quantity, course.steps or MOST_STEPS, drive.first)

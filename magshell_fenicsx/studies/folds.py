@@ -29,9 +29,10 @@ def has_knockdown(case: Case) -> bool:
     loading = case.loading
     # with a tolerance each point has its own mesh; a mesh file has no chart in which states are transferred
     by_one_mesh = case.mesh.tolerance is None and case.shell.geometry != "mesh"
-    return (
-        by_one_mesh and getattr(loading, "kind", "") == "pressure" and loading.until == "limit" and not loading.branches
-    )
+    if getattr(loading, "kind", "") != "pressure":
+        return False
+    # where the way ends before a fold, none is to be followed there
+    return by_one_mesh and loading.until == "limit" and not loading.branches and loading.bound is None
 
 
 def fold_row(scene: Scene, fold: Fold) -> Row:

@@ -130,7 +130,7 @@ def identify(
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
             mark = identity(made(_without_predictions(wider))) + repr([each.key for each in parameters])
-            predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field)
+            predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field, table.rows)
             done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
             for each in programmes:

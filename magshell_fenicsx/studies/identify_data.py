@@ -91,6 +91,8 @@ class Table:
         Name of a place of the shape -> where it is on the undeformed shell, in the unit of its displacements.
     missing
         Name of a column -> in how many rows it has no number.
+    rows
+        Settings -> the file and line of each reading, for messages.
     """
 
     columns: tuple[Column, ...]
@@ -100,6 +102,7 @@ class Table:
     places: str
     shape: Mapping[str, list[float]] = field(default_factory=dict)
     missing: Mapping[str, int] = field(default_factory=dict)
+    rows: Mapping[tuple[str, ...], list[str]] = field(default_factory=dict)
 
 
 class Names:
@@ -371,7 +374,7 @@ def table_of(
     if not results:
         raise CaseError(f"{where}: has no column with a result of this case")
     _refuse_unknown(section, [each for each, _ in results], where)
-    table = _listed(results, keys, at, places, section, where, rows)
+    table = _listed(results, keys, at, places, section, where, rows, rows_of_file.lines)
     sizes = [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE] if shape else []
     return replace(
         table, shape={name: [a * b for a, b in zip(at, sizes, strict=True)] for name, at in (shape or {}).items()}
@@ -393,10 +396,14 @@ def _listed(
     section: IdentifySection,
     where: str,
     points: Sequence[str],
+    lines: Sequence[int],
 ) -> Table:
-    """Rows as readings, those of the same settings together; an empty cell was not measured."""
+    """Rows as readings, those of the same settings together; an empty cell was not measured.
+
+    `where` is the file, and `lines` are those of the rows in it, for messages.
+    """
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
-    column = dict[tuple[str, ...], list[int]]()
+    column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
     for row in range(len(results[0][1])):
         settings = tuple(f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items())
         place = float(at[row]) if places else None
@@ -410,13 +417,14 @@ def _listed(
             readings.setdefault(settings, []).append(Reading(of, place if bound else None, change))
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
+            rows.setdefault(settings, []).append(f"{where}: line {lines[row]}")
     flat = np.array([value for each in data.values() for value in each])
     if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
         raise CaseError(f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite")
     numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
     empty = {own.header: int(np.isnan(values).sum()) for own, values in results}
     missing = {header: count for header, count in empty.items() if count}
-    return Table(tuple(own for own, _ in results), readings, flat, numbers, places, missing=missing)
+    return Table(tuple(own for own, _ in results), readings, flat, numbers, places, missing=missing, rows=rows)
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as field_of
 from functools import partial
@@ -19,7 +19,7 @@ from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.simulate.gradients.instabilities import Lost
-from magshell_fenicsx.simulate.readings import Outside, Reading, read
+from magshell_fenicsx.simulate.readings import NotRead, Outside, Reading, read
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design_blocks import Number
 from magshell_fenicsx.studies.identify_data import Parameter
@@ -61,6 +61,8 @@ class Predictor:
         Settings of the case -> what is read there.
     field
         The remanence that is looked for; its numbers follow the parameters.
+    rows
+        Settings of the case -> where each reading there stands in the data, for messages.
     """
 
     source: Source
@@ -71,6 +73,7 @@ class Predictor:
     mark: str
     comm: MPI.Intracomm
     field: RemanenceField | None = None
+    rows: Mapping[Settings, Sequence[str]] = field_of(default_factory=dict)
     count: int = 0
 
     def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
@@ -104,7 +107,8 @@ class Predictor:
                 fields = {NAME: (field.first.size, partial(field.by, scene))} if field else None
                 readings = read(scene, wanted, keys, slopes=slopes, fields=fields)
             except (Lost, CaseError, MeshError) as e:
-                note = f"{', '.join(settings)}: {e}" if settings else str(e)
+                about = [self._row_of(e, settings), ", ".join(settings), str(e)]
+                note = ": ".join(filter(None, about))
                 return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
             seen.values += [float(v) for v in readings.values]
             sizes = [float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters]  # type: ignore[arg-type]
@@ -112,6 +116,13 @@ class Predictor:
             seen.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
             seen.curves = seen.curves or readings.curves
         return seen
+
+    def _row_of(self, error: Exception, settings: Settings) -> str:
+        """Where the place that is not reached stands in the data; empty of another error."""
+        if not isinstance(error, NotRead):
+            return ""
+        rows = zip(self.rows.get(settings, ()), self.readings[settings], strict=False)
+        return next((row for row, reading in rows if reading.at == error.place), "")
 
     def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
         """A case, this or another one, for a vector of parameters; those of a field are in a file."""

@@ -15,7 +15,8 @@ from magshell_fenicsx.quantities.registry import IN_TIME, OWN_MODES, quantity
 
 BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
 NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))
-IN_SUMMARY = ("knockdown", "barrier", "critical_field", "snap_time")
+OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
+IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
 FORMS = f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 
 
@@ -49,8 +50,8 @@ class Scalar:
         if self.name == "critical_field":
             points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
             return _number(next(points, None))
-        if self.name == "snap_time":
-            return _number(next((snap["time"] for snap in summary.get("snaps", ())), None))
+        if self.name in OF_SNAPS:
+            return _number(next((snap[OF_SNAPS[self.name]] for snap in summary.get("snaps", ())), None))
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
             return None
@@ -78,6 +79,11 @@ def parse_scalar(text: str) -> Scalar:
         return Scalar(text)
     column, _, place = text.partition("@")
     at, _, number = place.partition("=")
+    if re.fullmatch(r"(omega2|hertz)_\d+", column):
+        raise CaseError(
+            f"--result {text}: {column} is a natural frequency, which path.csv has not: runs with "
+            "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients take it as a result"
+        )
     for name in (column, at) if place != "end" else (column,):
         if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
             raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")

@@ -1,12 +1,16 @@
 """Joints of plates: a hinge and a rigid joint against beams, a crease with a spring against two bars."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.follow import follow
@@ -100,7 +104,7 @@ def test_messages() -> None:
         MeshError, match=r"boundary.a_rim: is joined, by joints.0, and no edge of the surface; its edges"
     ):
         Case.from_source(lens).problem()
-    with pytest.raises(MeshError, match=r"joints.0.edges: left_right and right_left do not meet, by 0.1 R at \(1.1, "):
+    with pytest.raises(MeshError, match=r"joints.0.edges: left.right and right.left do not meet, by 0.1 R at \(1.1, "):
         deflected({"kind": "hinge"}, gap=0.1)
     with pytest.raises(
         CaseError, match=r"stiffness belongs to kind: spring, and must be given there; the kind is hinge"
@@ -112,3 +116,29 @@ def test_an_edge_joins_another_shell() -> None:
     """An edge lies on its own shell always: that joint would join nothing."""
     with pytest.raises(CaseError, match="stiffener: is the shell of the edge itself"):
         Case.load(CASES / "stiffened_plate.yaml", ["joints=[{edges: [stiffener.bottom, stiffener]}]"])
+
+
+BEAM = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
+LINE = {
+    "shells": {
+        "beam": {"shell": BEAM, "boundary": {"left": "clamped"}},
+        "arm": {"shell": BEAM, "place": {"position": [1, 0, 0]}, "points": {"end": [1, 0, 0]}},
+    },
+    "joints": [{"edges": ["beam.right", "arm.left"]}],
+    "loading": {"kind": "dead", "loads": [{"edge": "beam.right", "per_length": [0, 0, 1e-9]}], "factor": 1},
+}
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("loading.loads.0.edge=beam.right", "beam.right: is joined, by joints.0, and no edge of"),
+        ("loading.loads.0.edge=beam.nowhere", "loading.loads: edge: beam.nowhere: the surface has only arm."),
+        ("loading.loads=[{at: arm.tap, force: [0, 0, 1]}]", "arm.tap: name it in points, with its place; there are"),
+        ("shells.beam.boundary.right=clamped", "shells.beam.boundary.right: is joined, by joints.0, and no edge"),
+    ],
+)  # fmt: skip
+def test_names_in_messages_are_those_of_the_case(tmp_path: Path, setting: str, message: str) -> None:
+    (tmp_path / "line.yaml").write_text(yaml.safe_dump(LINE), encoding="utf-8")
+    with pytest.raises(CaseError, match=re.escape(message)):
+        describe(Case.load(tmp_path / "line.yaml", [setting]))

@@ -1,5 +1,6 @@
 """T-junctions: a stiffened plate against its beam, a plate that a web twists, derivatives, ranks, and messages."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shells.tee import Tee
 from magshell_fenicsx.simulate.follow import follow
@@ -50,6 +53,13 @@ def pushed(joint: dict[str, Any], off: float = 0.0) -> dict[str, Any]:
         "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "web.left", "force": [1e-9, 0, 0]}],
                     "factor": 1, "points": 1},
     }  # fmt: skip
+
+
+def placed(place: dict[str, Any]) -> dict[str, Any]:
+    """The same with the web elsewhere."""
+    data = pushed({})
+    data["shells"]["web"]["place"] = place
+    return data
 
 
 def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
@@ -134,5 +144,55 @@ def test_messages() -> None:
         MeshError, match=r"joints.0.edges: the edge web_right is not on the mid-surface of base, by 0.01 R"
     ):
         Scene(Case.from_source(pushed({}, off=0.01)))
-    with pytest.raises(MeshError, match=r"joints.0.edges: web_rim: is no edge; an edge stands first"):
+    with pytest.raises(MeshError, match=r"joints.0.edges: web.rim: is no edge; an edge stands first"):
         Scene(Case.from_source(pushed({}) | {"joints": [{"edges": ["web.rim", "base"]}]}))
+
+
+def ringed(radius: float) -> dict[str, Any]:
+    """A cylinder with a ring of some radius inside, on their meridians."""
+    material = {"thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    wall = {"geometry": "cylinder", "radius": 1, "length": 1, **material}
+    rib = {"geometry": "annulus", "radius": radius, "inner_radius": 0.9, **material}
+    return {
+        "shells": {
+            "wall": {"shell": wall, "boundary": {"bottom": "clamped"}},
+            "rib": {"shell": rib, "place": {"position": [0, 0, 0.5]}},
+        },
+        "joints": [{"edges": ["rib.outer", "wall"]}],
+        "loading": {"kind": "pressure"},
+    }
+
+
+LYING = {"position": [0.2, 0, 0], "axis": {"polar": 0}}  # in the plane of the base, its right edge in the middle
+ASLANT = {"position": [0.5 - 0.3 * np.cos(0.1), 0, 0.3 * np.sin(0.1)], "axis": {"polar": 180 * 0.1 / np.pi}}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (pushed({}, off=0.01), "the edge web.right is not on the mid-surface of base, by 0.01 R"),
+        (
+            pushed({}) | {"joints": [{"edges": ["web.left", "base"]}]},
+            "the edge web.left is not on the mid-surface of base, by more",
+        ),
+        (ringed(0.99), "the edge rib.outer is not on the mid-surface of wall, by 0.01 R at (0.99, 0, 0.5)"),
+        (
+            placed(LYING),
+            "the shell of the edge web.right lies in the mid-surface of base, where both take the same place",
+        ),
+    ],
+)
+def test_check_refuses_what_a_run_refuses(data: dict[str, Any], message: str) -> None:
+    """In the same words, but for the names of edges, which are those of the case."""
+    case = Case.from_source(data)
+    with pytest.raises(MeshError) as of_run:
+        Scene(case)
+    with pytest.raises(CaseError) as of_check:
+        describe(case)
+    assert message in str(of_check.value)
+    assert re.sub("(web|rib)_", r"\1.", str(of_run.value)) in str(of_check.value)
+
+
+def test_a_web_that_stands_aslant_is_accepted() -> None:
+    """At six degrees, where it takes the same place for ten thicknesses."""
+    assert "mesh: " in describe(Case.from_source(placed(ASLANT)))

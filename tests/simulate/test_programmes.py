@@ -214,3 +214,36 @@ def test_a_step_that_cannot_be_done(steps: Sequence[dict[str, Any]], said: str) 
     assert result.stopped
     assert said in result.stopped
     assert result.rows[-1]["p_over_pc"] > 0.5
+
+
+def test_first_instability_on_the_way_to_a_target() -> None:
+    """A field of -3 times is three times the opposite one: the same fold; before it there is none."""
+    load = {"kind": "field", "until": "limit", "points": 2}
+    dome = {"geometry": "cap", "polar": 40, "radius": 20, "thickness": 1, "poisson_ratio": 0.49}
+    critical = []
+    for size, factor in ((-0.01, 3), (0.01, -3)):
+        scene, records = history(
+            case({**load, "factor": factor}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": size})
+        )
+        assert [record.label for record in records if record.label != "step"] == ["start", "target", "fold"]
+        critical.append(scene.observe(records[-1].point.state)["lambda_m"])
+    assert critical[0] == pytest.approx(critical[1], rel=1e-8)
+    near = case({**load, "factor": -1}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": 0.01})
+    said = list[str]()
+    *_, last = follow(Scene(near), remark=said.append)
+    assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
+    assert said == ["step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"]
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        ({"until": "bifurcation", "factor": -3}, "loading.0: factor is a target: it goes with until: target or limit"),
+        ({"until": "limit", "factor": -3, "control": "load"}, "factor: beside until: limit stands one target"),
+        ({"until": "limit", "factor": 0}, "the target must not be zero"),
+    ],
+)
+def test_targets_that_are_no_end_of_a_way(step: dict[str, Any], message: str) -> None:
+    with pytest.raises(CaseError) as error:
+        case({"kind": "field", **step})
+    assert message in str(error.value)

@@ -9,6 +9,7 @@ import pytest
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.output.report.verdict import _snaps
 from magshell_fenicsx.runs.rows import columns, rows
 from magshell_fenicsx.runs.running import Interrupted
 from magshell_fenicsx.runs.summary import snaps
@@ -111,3 +112,26 @@ def test_a_resumed_snap_is_the_same() -> None:
         for column, values in wanted.items():
             if values.dtype.kind == "f":
                 assert np.nanmax(np.abs(found[column] - values), initial=0) <= 1e-12 * np.nanmax(np.abs(values)), column
+
+
+@pytest.mark.parametrize("late", [20.0, 60.0])
+def test_departure_and_jump(late: float) -> None:
+    """A logistic way goes from 0.1 to 0.9 in 2 ln 9 of its time, whenever it departs; the verdict says of what."""
+    t = np.concatenate([np.linspace(0, late + 30, 161), [late + 30]])
+    way = 1 / (1 + np.exp(late - t))
+    common = {"step": 1, "amplitude": "time", "dissipated": 0.0}
+    moving = [
+        {**common, "label": "step", "point": i, "time": at, "w_over_h": 3 * w}
+        for i, (at, w) in enumerate(zip(t, way, strict=True))
+    ]
+    moving[0] |= {"label": "fold", "amplitude": "load"}
+    moving[-1] |= {"label": "target"}
+    (snap,) = snaps(moving)
+    assert snap["jump"] == pytest.approx(2 * np.log(9), rel=2e-4)
+    assert snap["departure"] == pytest.approx(late - np.log(9), abs=2e-3)
+    assert snap["time"] == pytest.approx(late, abs=2e-3)
+    bare, *_ = _snaps({"snaps": [snap]})
+    assert bare.startswith("The snap takes 4.394 from 10 to 90 % of its way, after a departure from the fold of ")
+    assert bare.endswith("(times in R √(ρ/E); with a density of the shell they are in ms).")
+    (in_ms,) = _snaps({"snaps": [snap], "snap_jump_ms": 3.1, "snap_departure_ms": 28.0})
+    assert in_ms == "The snap takes 3.1 ms from 10 to 90 % of its way, after a departure from the fold of 28 ms."

@@ -331,3 +331,28 @@ def test_the_program_of_the_howto_on_one_two_and_three_ranks(tmp_path: Path) -> 
     one, *others = (folds(tmp_path / str(ranks), ranks) for ranks in (1, 2, 3))
     for other in others:
         assert other == pytest.approx(one, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"radius": "25 mm", "thickness": "2 mm"}, "times as long as radius, 25 mm: give unit="),
+        ({"thickness": "2 mm"}, "e+04 times as long as thickness, 2 mm: give unit="),
+        ({"thickness": "25 m"}, "2 times as long as thickness"),
+        ({"thickness": "2 mm", "unit": "m"}, ""),
+        ({"radius": "25 mm", "thickness": "2 mm", "unit": "mm"}, ""),
+        ({"radius": "25 m", "thickness": "0.2 m"}, ""),
+        ({"radius": 25, "thickness": 2}, ""),
+    ],
+)
+def test_a_mesh_in_mm_is_not_in_metres(dome: Dome, sizes: dict[str, Any], message: str) -> None:
+    """The dome is 50 wide; only its unit says of what."""
+    domain, facet_tags, _ = dome
+    keys = {"edges": {"rim": 2}, "facet_tags": facet_tags, "youngs_modulus": "1 MPa", "poisson_ratio": 0.4, **sizes}
+    if not message:
+        ms.Shell(domain, **keys)
+        return
+    with pytest.raises(ms.CaseError) as error:
+        ms.Shell(domain, **keys)
+    assert "shell.unit: is not given" in str(error.value)
+    assert message in str(error.value)

@@ -238,7 +238,12 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "settings", "said"),
     [
-        ("applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n", [], "applied_mT = 30 is outside the path, which goes from 0"),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n",
+            [],
+            r"data: --data .*measured.csv: line 3: applied_mT = 30 is outside the path, which goes from 0",
+        ),
+        ("applied [mT],tip_uz [mm]\n\n5,9\n\n-3,1\n10,12\n", [], r"line 5: applied_mT = -3 is outside the path"),
         ("applied [mT],tip_uz\n5,9\n", [], r"tip_uz: has no unit: write tip_uz \[mm\]"),
         ("applied,tip_uz [mm]\n5,9\n", [], r"applied: has no unit: write applied \[mT\]"),
         ("applied [mT],tip_uz [s]\n5,9\n", [], "column tip_uz: its unit s"),

@@ -45,6 +45,13 @@ def test_result_at_a_requested_point_is_its_row() -> None:
     assert parse_scalar("force@end").of({}, rows) == 4.4
 
 
+def test_a_frequency_is_no_column() -> None:
+    with pytest.raises(
+        CaseError, match=r"--result hertz_1@end: hertz_1 is a natural frequency, which path.csv has not"
+    ):
+        parse_scalar("hertz_1@end")
+
+
 def test_result_between_points_is_cubic() -> None:
     """F = w^3 is met exactly; the field's part of the path, which meets it in a corner, is left out."""
     rows = path(("", -9.0, 5.0), ("lambda_m", 0.0, 0.0), *(("force", w, w**3) for w in (1.0, 2.0, 3.5)))
@@ -76,7 +83,7 @@ def test_results_of_the_summary() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("k_d", "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, COLUMN@"),
+        ("k_d", "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, snap_dep"),
         ("force", "nothing is no column"),
         ("force@w=1", "w is no column"),
         ("label@end", "label is no column"),

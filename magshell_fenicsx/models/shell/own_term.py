@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
 SAME = 1e-10  # difference of two values that is rounding, over the larger
+OTHER_COORDINATES = np.array([[1.1, 0.7], [-0.4, 0.8]])  # by the jets' own: turned, stretched and sheared
+IN_COORDINATES, SURELY = 4, 1e-6  # samples in both; difference of values, over the larger, that is not rounding
 
 
 def symbolic_functions() -> dict[str, Callable[..., Any]]:
@@ -170,6 +172,7 @@ class OwnTerm:
 
         if self.of_volume and self.on is not None:
             raise ValueError(f"{self.name}: a density is that of a volume or that of an edge, not both")
+        self._refuse_coordinates()
         bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
@@ -343,6 +346,24 @@ class OwnTerm:
             and terminal not in arguments
         ]
 
+    def _refuse_coordinates(self) -> None:
+        """See that every density is the same in other coordinates of the surface; each cell has its own.
+
+        Raises
+        ------
+        ValueError
+            With the density that is not.
+        """
+        for column, density in zip(("", *self.observed)[-len(self.densities) :], self.densities, strict=True):
+            for sample in _random_samples()[:IN_COORDINATES]:
+                one, other = self._value(sample, density), self._value(_in_other_coordinates(sample), density)
+                if abs(one - other) > SURELY * max(abs(one), abs(other)):  # nan: it has no value there
+                    raise ValueError(
+                        f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 and r2, which are "
+                        "others in each cell: build it from kinematics (inverse_metric, membrane_strain, normal, ...), "
+                        "and derivatives along an edge by edge.by_outward and edge.by_length"
+                    )
+
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients)
@@ -387,6 +408,17 @@ def _random_samples() -> list[Sample]:
     rng = np.random.default_rng(2026)
     jets, covectors = rng.uniform(-1, 1, (SAMPLES, 2, 6, 3)), rng.uniform(-1, 1, (SAMPLES, 2))
     return [(jets[i, 0], jets[i, 1] / 4, covectors[i]) for i in range(SAMPLES)]
+
+
+def _in_other_coordinates(sample: Sample) -> Sample:
+    """The same jets and the same covector, in other coordinates of the surface."""
+    A = OTHER_COORDINATES
+    (r0, u), m = (np.array(jet) for jet in sample[:2]), sample[2]
+    for jet in (r0, u):
+        second = jet[[3, 4, 4, 5]].reshape(2, 2, 3)
+        jet[1:3] = A @ jet[1:3]
+        jet[3:] = np.einsum("ai,bj,ijc->abc", A, A, second).reshape(4, 3)[[0, 1, 3]]
+    return r0, u, A @ m
 
 
 def _as_jet(parts: Array) -> Jet:

@@ -216,16 +216,21 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 
 def _snaps(summary: Summary) -> list[Markup]:
-    """How long the first snap takes until half way, and how far beyond its end it goes."""
-    if not (snaps := summary.get("snaps")):
+    """How long the first snap takes from a tenth to nine tenths of its way, after its departure from the fold, and how
+    far beyond its end it goes."""
+    snaps = summary.get("snaps")
+    if not snaps or "jump" not in snaps[0]:  # of an earlier version
         return []
-    time = summary.get("snap_time_ms")
-    took = (
-        Markup("{} ms").format(number(time, 4)) if time else Markup("the time {}").format(number(snaps[0]["time"], 4))
+    in_ms = "snap_jump_ms" in summary
+    jump, departure = (
+        Markup("{} ms").format(number(summary[f"snap_{key}_ms"], 4)) if in_ms else number(snaps[0][key], 4)
+        for key in ("jump", "departure")
     )
+    bare = "" if in_ms else Markup(" (times in R √(ρ/E); with a density of the shell they are in ms)")
     beyond = 100 * float(snaps[0]["overshoot"])
     more = Markup(", and overshoots by {} % of its way").format(number(beyond, 2)) if beyond > LEAST_BEYOND else ""
-    return [Markup("The snap takes {} until half way{}.").format(took, more)]
+    words = "The snap takes {} from 10 to 90 % of its way, after a departure from the fold of {}{}{}."
+    return [Markup(words).format(jump, departure, bare, more)]
 
 
 def _error(summary: Summary) -> list[Markup]:

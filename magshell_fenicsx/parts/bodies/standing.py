@@ -63,7 +63,8 @@ def contacts(
 
 def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> Contact:
     key, h, Q = f"bodies.{name}", ground.h, ground.Q
-    if ground.geometry == "mesh" and section.position is not None and "at" not in section.model_fields_set:
+    stands = section.position is not None and "at" not in section.model_fields_set
+    if stands and (ground.geometry == "mesh" or section.direction is not None):
         places = ground.perfect.sample()
         place = places[np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()]
     else:

@@ -182,6 +182,17 @@ class DeadSection(PathStep):
         for i, load in enumerate(self.loads):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
+    def warning(self, step: ProgrammeStep) -> str | None:
+        """A pressure by formula keeps its direction, where that of a fluid would turn with the surface."""
+        varying = next((i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None)
+        if varying is None:
+            return None
+        return (
+            f"{step.key}.loads.{varying}.pressure: dead: per undeformed area, fixed to the material and along the "
+            "undeformed normal; a live one, as of a fluid, turns with the surface (a ring buckles at 3/4 of the dead "
+            "one) and is the same everywhere: kind: pressure"
+        )
+
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)
 

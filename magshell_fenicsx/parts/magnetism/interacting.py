@@ -39,6 +39,12 @@ SAME = 1e-7  # over R: places of a node and its image on a mirror plane
 LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
+TOO_NEAR = (
+    "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or than a seventh of "
+    "the size of their cells: move them apart, or take smaller cells"
+)
+
+
 def polar(F: Array) -> Array:
     """The rotations nearest to matrices (n, 3, 3)."""
     U, _, V = np.linalg.svd(F)
@@ -113,10 +119,7 @@ class InteractionTerm:
         except Touching:
             near = True
         if self._comm.allreduce(near, MPI.LOR):
-            raise CaseError(
-                "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or "
-                "than a seventh of the size of their cells: move them apart, or take smaller cells"
-            )
+            raise CaseError(TOO_NEAR)
 
     def energy(self) -> float:
         return self._evaluated()[0]

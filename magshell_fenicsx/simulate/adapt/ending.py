@@ -264,7 +264,8 @@ class History:
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
         if not self.located:
-            raise NoResult(stopped or "the case has neither a load nor a field")
+            none = "there is no instability up to the target" if steps and steps[-1].load.bound else ""
+            raise NoResult(stopped or none or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]
         departures = [record for record in self._departures(scene) if record.step == in_last[0].step]
         return _instability(departures[0] if departures else in_last[-1 if until == "bifurcation" else 0])

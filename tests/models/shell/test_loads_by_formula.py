@@ -132,3 +132,21 @@ def test_potential_is_refused_where_it_is_none() -> None:
         loading = {"kind": "dead", "control": "displacement", "displacement": 1, "loads": [{"potential": "z", **more}]}
         with pytest.raises(ms.CaseError, match=said):
             ms.Case.from_source(Source("test", {"shell": CAP, "loading": loading, "boundary": {"rim": "clamped"}}))
+
+
+@pytest.mark.parametrize(
+    ("load_", "warned"),
+    [({"pressure": "1e-6*(1 + 0*z)"}, True), ({"pressure": 1e-6}, False), ({"per_area": [0, 0, "1e-6*x"]}, False)],
+)
+def test_warning_of_a_dead_pressure_by_formula(load_: dict[str, Any], warned: bool) -> None:
+    """A fluid's pressure turns with the surface: a long tube buckles at 3 D/R³ under it, at 4 D/R³ under a dead one."""
+    case = load(
+        CAP,
+        {"at": "top", "force": [0, 0, -1e-6]},
+        {"over": "all", **load_},
+        boundary={"rim": "clamped"},
+        points={"top": [0, 0, 2]},
+    )
+    warnings = make_problem(case).warnings
+    assert len(warnings) == warned
+    assert all(said.startswith("loading.loads.1.pressure: dead: per undeformed area") for said in warnings)

@@ -295,8 +295,13 @@ def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str)
 
 def test_a_solid_has_no_curvature() -> None:
     case = Case.load(CASES / "solid_buckling.yaml")
-    curved = OwnTerm("own", lambda r0, u: r0.r11[0] * u.r[2])
-    with pytest.raises(CaseError, match=r"own depends on r0\.r11, which only"):
+
+    def mean_curvature(r0: Jet) -> Expr:
+        b11, b12, b22 = (ufl.dot(kin.normal(r0), second) for second in (r0.r11, r0.r12, r0.r22))
+        return ufl.tr(kin.mixed(ufl.as_matrix([[b11, b12], [b12, b22]]), kin.inverse_metric(r0))) / 2
+
+    curved = OwnTerm("own", lambda r0, u: mean_curvature(r0) * u.r[2])
+    with pytest.raises(CaseError, match=r"own depends on r0\.r11, r0\.r12, r0\.r22, which only"):
         make_problem(case, [curved])
 
 
@@ -335,3 +340,38 @@ def test_a_term_that_only_observes(model: str, symmetry: str) -> None:
     assert row["area"] == pytest.approx(0.1)
     assert "mean" not in scene.extra_columns
     assert "mean" not in record.point.state.mu
+
+
+ALONG = (lambda r0, u: ufl.dot(u.r1, u.r1), lambda r0, u: ufl.dot(u.r1, u.r1) + ufl.dot(u.r2, u.r2))
+
+
+@pytest.mark.parametrize(
+    ("density", "observed", "on"),
+    [
+        *((of, {}, None) for of in ALONG),
+        (None, {"seen": ALONG[0]}, None),
+        (lambda r0, u: u.r[2], {"seen": lambda r0, u: ufl.dot(r0.r1, u.r)}, None),
+        (lambda r0, u, edge: edge.stretch * u.r[2], {}, "rim"),
+    ],
+)
+def test_cells_have_no_directions(density: Density | None, observed: dict[str, Density], on: str | None) -> None:
+    """r1 and r2 are along the sides of each cell: their lengths and directions are of the mesh, not of the shell."""
+    with pytest.raises(
+        ValueError, match=rf"own{': seen' if observed else ''}: depends on the coordinates of r1 and r2"
+    ):
+        OwnTerm("own", density, observed=observed, on=on)
+
+
+def test_invariant_densities_are_accepted() -> None:
+    """The surface's gradient, a bending energy that is observed, derivatives along an edge, one without a value."""
+
+    def gradient(r0: Jet, u: Jet) -> Expr:
+        up, along = kin.inverse_metric(r0), (u.r1, u.r2)
+        return sum(up[i, j] * ufl.dot(along[i], along[j]) for i in range(2) for j in range(2))
+
+    def bent(r0: Jet, u: Jet) -> Expr:
+        return ufl.tr(kin.mixed(kin.curvature_change(r0, u), kin.inverse_metric(r0))) ** 2
+
+    OwnTerm("own", gradient, observed={"bent": bent})
+    OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.by_outward(u), edge.by_length(u)), on="rim")
+    OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * ufl.dot(kin.normal(r0 + u), u.r))

@@ -122,3 +122,24 @@ def test_refused(bodies: dict[str, Any], words: str) -> None:
 def test_two_obstacles_may_overlap() -> None:
     """If neither moves."""
     assert len(problem({"a": APART, "b": {**APART, "position": [0, 0, 1.5]}}).loads.contacts) == 2
+
+
+PART = {"geometry": "cap", "radius": 1, "thickness": 0.03, "polar": 85, "hole": 15}
+PART |= {"azimuth": [-10, 10], "youngs_modulus": 1, "poisson_ratio": 0.3}
+BALL = {"kind": "sphere", "radius": 0.5, "position": [0, 0, 0], "direction": [0, 0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("ball", "message"),
+    [
+        ({"direction": None}, r"bodies.ball.at: is not given, and the pole is in the hole of the shell: give"),
+        ({"at": {"polar": 10}}, r"bodies.ball.at.polar: 10: is not on the shell: allowed 15 to 85, beside its hole"),
+        ({"at": {"polar": 40, "azimuth": 90}}, r"bodies.ball.at.azimuth: 90: is not on the shell: allowed -10 to 10"),
+    ],
+)  # fmt: skip
+def test_a_ball_beside_a_hole(ball: dict[str, Any], message: str) -> None:
+    """A place and a direction say where it is: the pole, which is in the hole, is not asked for."""
+    (contact,) = problem({"ball": BALL}, shell=PART, boundary={"hole": "clamped"}).loads.contacts
+    assert contact.distance(np.array([[0, 0, 1.0]]))[0] == pytest.approx(0.5)
+    with pytest.raises(CaseError, match=message):
+        problem({"ball": {**BALL, **ball}}, shell=PART, boundary={"hole": "clamped"})

@@ -17,6 +17,7 @@ from scipy.integrate import solve_bvp
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.whole import WholeMatrix
+from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.input.source import CaseError, Source
@@ -309,8 +310,9 @@ def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
 def test_parts_that_are_near_from_the_start(model: Any, tmp_path: Path) -> None:
     """In each other, their energy were no number: refused before anything is written, with what to do."""
     strips(tmp_path / "near.msh", 4.0, 1.0, 0.04, 2.0)
-    with pytest.raises(CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"):
-        Scene(case_of(tmp_path / "near.msh", 0.1))
+    for refused in (Scene, describe):
+        with pytest.raises(CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"):
+            refused(case_of(tmp_path / "near.msh", 0.1))
 
 
 SHELL = {"geometry": "mesh", "unit": "mm", "radius": "5 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
