@@ -381,7 +381,7 @@ class Path:
     def _jumped(self, here: Point, there: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
         length = there.s - here.s
-        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
+        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.passes_several:
             return "the step passed several instabilities, or jumped to another branch"
         same = there.negative_pivots == here.negative_pivots or here.across is not None
         corner = self.newton.options.kinks and same  # no corner is an instability, but where the load turns back

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from continuation.toys import closed_loop, pitchfork, snap_back
+from continuation.toys import Toy, closed_loop, pitchfork, snap_back
 
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -184,3 +184,61 @@ def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     assert np.sort(x)[:12] == pytest.approx(np.sort(exact), abs=1e-9)
     assert np.mean([p.iterations for p in found]) < 4
     assert np.all(np.diff(x) > 0)  # in the order of the path
+
+
+def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2) -> Toy:
+    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on.
+
+    So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in a shell.
+    """
+    first = 1 + distance * np.arange(count)
+
+    def gradient(x: np.ndarray) -> np.ndarray:
+        u, v = x[0], x[1:]
+        if abs(u - 1) < hidden:
+            return np.full(1 + count, np.nan)
+        return np.array([u - np.sum(v**2) / 2, *((first - u) * v + v**3)])
+
+    def hessian(x: np.ndarray) -> np.ndarray:
+        K = np.diag([1.0, *(first - x[0] + 3 * x[1:] ** 2)])
+        K[0, 1:] = K[1:, 0] = -x[1:]
+        return K
+
+    return Toy(gradient, hessian, 1 + count)
+
+
+def along_column(toy: Toy, control: str, goal: Goal) -> Walk:
+    path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 1e-6))
+    u = np.zeros(toy.size)
+    u[0] = 0.7013
+    return Walk(path, path.start(State(u, {"load": u[0]})), goal)
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
+@pytest.mark.parametrize("count", [2, 6])
+def test_a_cluster_of_modes_is_passed(control: str, count: int) -> None:
+    """Modes 1e-9 apart, with no point within 1e-4 of them."""
+    toy, solves = column_of_modes(1e-9, 1e-4, count), list[float]()
+    tangent = toy.tangent
+    toy.tangent = lambda u, mu, stress=(): (solves.append(u[0]), tangent(u, mu, stress))[1]  # type: ignore[method-assign]
+    walk = along_column(toy, control, Goal("target", [1.5]))
+    labels = [label for label, _ in walk]
+    assert labels[-1] == "target"
+    assert labels.count("bifurcation") == 1
+    assert walk.points[-1].negative_pivots == count
+    ((low, high),) = walk.clusters
+    assert low.state.mu["load"] < 1 - 1e-4
+    assert high.state.mu["load"] > 1 + 1e-4
+    assert high.negative_pivots - low.negative_pivots == count
+    assert low.load_error == pytest.approx(high.state.mu["load"] - low.state.mu["load"])
+    assert low.load_error < 0.004  # no step over several modes is longer
+    assert len(solves) < 400
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
+def test_modes_too_close_to_part_count_as_one(control: str) -> None:
+    walk = along_column(column_of_modes(1e-9), control, Goal("limit"))
+    *_, (label, point) = walk
+    assert label == "bifurcation"
+    assert not walk.clusters
+    assert point.state.mu["load"] == pytest.approx(1.0, abs=1e-5)
