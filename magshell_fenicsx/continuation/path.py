@@ -415,11 +415,14 @@ class Path:
             return False
         return not far.point.turned_from(here) and not self.apart(here, self.seen_from(here, far.point))
 
-    def apart(self, low: Point, high: Point) -> bool:
-        """Whether two points are farther apart than a path between them is long, as their tangents show it."""
+    def apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
+        """Whether two points are farther apart than a path between them is long, as their tangents show it.
+
+        A distance below `least`, in lengths of the system, is that of rounding.
+        """
         comm = self.system.comm
         reach = FARTHER * abs(high.s - low.s) * max(max_abs(comm, low.du), max_abs(comm, high.du))
-        return max_abs(comm, high.state.u - low.state.u) > max(reach, SEEN * self.system.length)
+        return max_abs(comm, high.state.u - low.state.u) > max(reach, least * self.system.length)
 
     def _explained(self, here: Point, there: Point) -> bool:
         """Whether a path with a corner somewhere between two points leads from one to the other."""

@@ -22,6 +22,7 @@ MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a 
 MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
 MOST_SOLVES = 60  # in the search for one instability, with its repetitions in shorter steps
 MOST_REPEATED = 3  # searches in shorter steps, before several instabilities count as a cluster
+PARTED = 1e-4  # in lengths: about a neutral mode rounding moves a state by less
 BESIDE = 0.5  # of the way between two points: what is farther from their cubic lies on another branch
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
@@ -239,7 +240,7 @@ class _Search:
         An imperfect bifurcation has two paths close to each other, of different inertia: a bracket with an end on each
         shrinks to nothing in s and contains no instability.
         """
-        if self.path.apart(low, high):
+        if self.path.apart(low, high, PARTED):
             raise PathStopped("the step jumped to another branch", low)
 
     def spent(self, point: Point) -> Point:

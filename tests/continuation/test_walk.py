@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from continuation.toys import Toy, closed_loop, pitchfork, snap_back
+from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap_back
 
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Label, Walk
+from magshell_fenicsx.continuation.walk import Goal, Label, Walk, instabilities
 
 K, C = 0.4, 1.9
 FOLDS = 1 - 1 / np.sqrt(3), 1 + 1 / np.sqrt(3)
@@ -186,27 +186,6 @@ def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     assert np.all(np.diff(x) > 0)  # in the order of the path
 
 
-def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2) -> Toy:
-    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on.
-
-    So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in a shell.
-    """
-    first = 1 + distance * np.arange(count)
-
-    def gradient(x: np.ndarray) -> np.ndarray:
-        u, v = x[0], x[1:]
-        if abs(u - 1) < hidden:
-            return np.full(1 + count, np.nan)
-        return np.array([u - np.sum(v**2) / 2, *((first - u) * v + v**3)])
-
-    def hessian(x: np.ndarray) -> np.ndarray:
-        K = np.diag([1.0, *(first - x[0] + 3 * x[1:] ** 2)])
-        K[0, 1:] = K[1:, 0] = -x[1:]
-        return K
-
-    return Toy(gradient, hessian, 1 + count)
-
-
 def along_column(toy: Toy, control: str, goal: Goal) -> Walk:
     path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 1e-6))
     u = np.zeros(toy.size)
@@ -242,3 +221,18 @@ def test_modes_too_close_to_part_count_as_one(control: str) -> None:
     assert label == "bifurcation"
     assert not walk.clusters
     assert point.state.mu["load"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
+    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends at a fold."""
+    imperfection = 1e-5
+    newton = BorderedNewton(pitchfork(imperfection))
+    path, ends = Path(newton, "load", "load", StepOptions(0.4, 0.4, 1e-6)), []
+    for load in (0.8, 1.2):
+        v = min(np.roots([1, 0, 1 - load, -imperfection]), key=abs).real
+        ends.append(path.start(State(np.array([load + v**2 / 2, v]), {"load": load})))
+    assert [end.negative_pivots for end in ends] == [0, 1]
+    before = newton.factorisation.count
+    with pytest.raises(PathStopped, match="another branch"):
+        list(instabilities(path, *ends))
+    assert newton.factorisation.count - before < 400
