@@ -550,6 +550,8 @@ class Walk:
                 raise
             allowance.renew()
             yield self._cluster(e.point, e.high)
+            behind = self.path.as_base(e.high)
+            yield from self._located(behind, self.path.measured_from(behind, high))
         except PathStopped:
             allowance.end, allowance.clustered = high, False
             raise

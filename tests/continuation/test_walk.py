@@ -215,6 +215,18 @@ def test_a_cluster_of_modes_is_passed(control: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("control", ["load", "arc"])
+def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> None:
+    toy, u = column_of_modes(1e-9, 1e-4, 2, 1.005), np.zeros(4)
+    u[0] = 0.9913
+    path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 0.02, several=0.03))
+    walk = Walk(path, path.start(State(u, {"load": u[0]})), Goal("points", steps=1))
+    events = [point for label, point in walk if label == "bifurcation"]
+    assert [point.negative_pivots for point in events] == [0, 2]
+    assert events[0] is walk.clusters[0][0]
+    assert events[1].state.mu["load"] == pytest.approx(1.005, rel=1e-8)
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
 def test_modes_too_close_to_part_count_as_one(control: str) -> None:
     walk = along_column(column_of_modes(1e-9), control, Goal("limit"))
     *_, (label, point) = walk

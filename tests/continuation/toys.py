@@ -117,12 +117,13 @@ def snap_back(k: float, c: float) -> Toy:
     return Toy(gradient, hessian, 3)
 
 
-def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2) -> Toy:
-    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on.
+def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2, *others: float) -> Toy:
+    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on, and at others.
 
     So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in a shell.
     """
-    first = 1 + distance * np.arange(count)
+    first = np.array([*(1 + distance * np.arange(count)), *others])
+    count = len(first)
 
     def gradient(x: Vector) -> Vector:
         u, v = x[0], x[1:]
