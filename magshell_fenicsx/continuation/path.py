@@ -35,6 +35,7 @@ VAIN = 5  # failures one after the other, after which no line search is tried: a
 NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
 ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
+FARTHER = 3.0  # two states that are so many times as far apart as their tangents lead are not on one path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -257,12 +258,14 @@ class Path:
             while (here := course.here).s != target:
                 plan = self._planned(course, target, arrive)
                 tried = self._tried(here, plan)
+                corners = isinstance(tried, Far) and self._passes_corners(here, tried, plan)
                 if isinstance(tried, Far):
-                    course.far, tried = tried, tried.reason
+                    course.far, tried = (None, self.as_base(tried.point)) if corners else (tried, tried.reason)
                 if isinstance(tried, str):
                     course.failed(plan, tried, self.options.smallest)
                     continue
-                straight, corner = self._cosine(here, tried) > self.options.straight, self._corner(here, tried)
+                straight = self._cosine(here, tried) > self.options.straight
+                corner = corners or self._corner(here, tried)
                 course.reached(tried, plan, self.options, straight=straight, corner=corner)
                 yield tried, tried.s == target
                 if course.far and self._look_again(course, course.far, np.sign(target - here.s)):
@@ -378,7 +381,7 @@ class Path:
     def _jumped(self, here: Point, there: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
         length = there.s - here.s
-        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
+        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.passes_several:
             return "the step passed several instabilities, or jumped to another branch"
         same = there.negative_pivots == here.negative_pivots or here.across is not None
         corner = self.newton.options.kinks and same  # no corner is an instability, but where the load turns back
@@ -401,6 +404,25 @@ class Path:
     def _corner(self, here: Point, there: Point) -> bool:
         """Whether the path has a corner between two points, from before which nothing behind it is foreseen."""
         return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
+
+    def _passes_corners(self, here: Point, far: Far, plan: Plan) -> bool:
+        """Whether a turn by arc length, in the shortest step, is that of corners where points of a body touch.
+
+        Half as long a step would end before a corner that is just ahead, or behind two that are close.
+        """
+        shortest = plan.length / 2 < self.options.smallest
+        if not (shortest and self.control == "arc" and self.newton.options.corners and far.reason == TURNS):
+            return False
+        return not far.point.turned_from(here) and not self.apart(here, self.seen_from(here, far.point))
+
+    def apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
+        """Whether two points are farther apart than a path between them is long, as their tangents show it.
+
+        A distance below `least`, in lengths of the system, is that of rounding.
+        """
+        comm = self.system.comm
+        reach = FARTHER * abs(high.s - low.s) * max(max_abs(comm, low.du), max_abs(comm, high.du))
+        return max_abs(comm, high.state.u - low.state.u) > max(reach, least * self.system.length)
 
     def _explained(self, here: Point, there: Point) -> bool:
         """Whether a path with a corner somewhere between two points leads from one to the other."""

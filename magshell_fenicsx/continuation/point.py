@@ -166,6 +166,8 @@ class StepOptions:
         branch, and a smaller step is tried.
     gap
         Largest part of a step that the tangents at its ends may leave unexplained. A larger one counts as a jump too.
+    several
+        The longest step that may pass more than one instability; 0: an eighth of the first.
     """
 
     first: float
@@ -177,3 +179,9 @@ class StepOptions:
     straight: float = 0.9
     turn: float = 0.5
     gap: float = 0.1
+    several: float = 0.0
+
+    @property
+    def passes_several(self) -> float:
+        """The longest step that may pass more than one instability."""
+        return self.several or self.first / 8

@@ -77,6 +77,8 @@ class NewtonOptions:
     stiffnesses
         Amplitudes that are the stiffness of faces between which forces set in within a step, as where shells touch,
         with their values in a state that has none.
+    corners
+        Whether a path has corners although full steps do not circle, as where points of rigid bodies touch.
     """
 
     tolerance: float = 1e-9
@@ -88,6 +90,7 @@ class NewtonOptions:
     largest_step: float = 1e4
     patience: int = 4
     stiffnesses: Mapping[str, float] = field(default_factory=dict)
+    corners: bool = False
 
     @property
     def kinks(self) -> bool:

@@ -1,7 +1,7 @@
 """A walk along a path to its goal, with every instability located and every requested point on the way."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -20,6 +20,9 @@ MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
 MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a point between its ends
 MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
+MOST_SOLVES = 60  # in the search for one instability, with its repetitions in shorter steps
+MOST_REPEATED = 3  # searches in shorter steps, before several instabilities count as a cluster
+PARTED = 1e-4  # in lengths: about a neutral mode rounding moves a state by less
 BESIDE = 0.5  # of the way between two points: what is farther from their cubic lies on another branch
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
@@ -42,20 +45,65 @@ class Instability:
     kind: Literal["fold", "bifurcation"]
 
 
-def instabilities(path: Path, low: Point, high: Point, tolerance: float = LOCATED) -> Iterator[Instability]:
+class Clustered(PathStopped):
+    """Several instabilities, between `point` and `high`, are not parted by the points that can be found there."""
+
+    def __init__(self, point: Point, high: Point) -> None:
+        super().__init__("several instabilities lie too close to each other", point)
+        self.high = high
+
+
+@dataclass
+class Allowance:
+    """Bounds of the search for the next instability, its repetitions in shorter steps included.
+
+    Attributes
+    ----------
+    solves
+        That have been tried.
+    repeated
+        Number of searches that ended between instabilities which they could not part.
+    end
+        Of the step in which the last search failed.
+    clustered
+        Whether that was between instabilities.
+    """
+
+    solves: int = 0
+    repeated: int = 0
+    end: Point | None = None
+    clustered: bool = False
+
+    @property
+    def spent(self) -> bool:
+        """Whether no further solve is allowed."""
+        return self.solves >= MOST_SOLVES
+
+    def renew(self) -> None:
+        """Begin with the next instability."""
+        self.solves, self.repeated, self.end, self.clustered = 0, 0, None, False
+
+
+def instabilities(
+    path: Path, low: Point, high: Point, tolerance: float = LOCATED, allowance: Allowance | None = None
+) -> Iterator[Instability]:
     """All singular points between two successive points, in order, as far as inertia and tangents reveal them.
 
     Parameters
     ----------
     tolerance
         Of the amplitude, relative.
+    allowance
+        Of this search and of those before it for the same instability; None: there were none.
 
     Raises
     ------
     PathStopped
         If Newton's method fails between the two points.
+    Clustered
+        If no point is found between several instabilities.
     """
-    search = _Search(path, low, tolerance)
+    search = _Search(path, low, tolerance, allowance or Allowance())
     yield from search.between(low, path.seen_from(low, high), MOST_HALVINGS)
 
 
@@ -66,6 +114,7 @@ class _Search:
     path: Path
     base: Point
     tolerance: float
+    allowance: Allowance = field(default_factory=Allowance)
     iterations: int = 0
     factorisations: int = 0
 
@@ -89,7 +138,8 @@ class _Search:
         else:
             middle = self.middle(low, high)
             if middle is None:
-                raise PathStopped("several instabilities lie too close to each other", low)
+                self.refuse_apart(low, high)
+                raise Clustered(low, high)
             yield from self.between(low, middle, halvings - 1)
             yield from self.between(middle, high, halvings - 1)
 
@@ -120,6 +170,9 @@ class _Search:
     def middle(self, low: Point, high: Point) -> Point | None:
         """A point somewhere between two others, with its own inertia; rounding may hide some places."""
         for part in MIDDLE:
+            if self.allowance.spent:
+                return None
+            self.allowance.solves += 1
             solved = self.try_at(low.s + part * (high.s - low.s), low, high)
             if not isinstance(solved, str):
                 return self.path.exact(solved, self.base)
@@ -178,12 +231,23 @@ class _Search:
             if middle is None:
                 break
             low, high = (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+            self.refuse_apart(low, high)
         return replace(self.spent(low), load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+    def refuse_apart(self, low: Point, high: Point) -> None:
+        """Refuse two points that are not on one path.
+
+        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket with an end on each
+        shrinks to nothing in s and contains no instability.
+        """
+        if self.path.apart(low, high, PARTED):
+            raise PathStopped("the step jumped to another branch", low)
 
     def spent(self, point: Point) -> Point:
         """The point with the work since the last located one."""
         done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
         self.iterations = self.factorisations = 0
+        self.allowance.renew()
         return done
 
     def finished(self, point: Point) -> Point:
@@ -341,6 +405,9 @@ class Walk:
         The start, the steps so far, and the instability or target that ended the walk.
     done
         Whether the last point ends the walk.
+    clusters
+        The first points before, and behind, instabilities that were not parted. Such a cluster counts as one
+        instability, at the first of both points; its width is the error of the amplitude.
     """
 
     def __init__(
@@ -348,7 +415,9 @@ class Walk:
     ) -> None:
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self.done = False
+        self.clusters: list[tuple[Point, Point]] = []
         self._folds: list[Point] = []
+        self._allowance = Allowance()
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
         """Labels and points, in the order of the path.
@@ -360,7 +429,7 @@ class Walk:
         """
         options, shorter, why = self.path.options, None, ""
         while True:
-            for point, reached in self.path.towards(self.points[-1], self._ahead(), self._arrive):
+            for point, reached in self._steps():
                 low, shorter = self.path.before(self.points[-1], point), None
                 try:
                     state = self._renew(low, point) if self._renew else None
@@ -400,7 +469,22 @@ class Walk:
                 return
             if shorter < options.smallest:
                 raise PathStopped(why, self.points[-1])
-            self.path = self.path.in_steps(replace(options, first=shorter))
+            # a step must still reach behind instabilities between which there are no points
+            several = options.passes_several if self._allowance.clustered else 0.0
+            self.path = self.path.in_steps(replace(options, first=shorter, several=several))
+
+    def _steps(self) -> Iterator[tuple[Point, bool]]:
+        """Points ahead, as `Path.towards` has them; the end of an earlier step where none is found before a cluster."""
+        try:
+            yield from self.path.towards(self.points[-1], self._ahead(), self._arrive)
+        except PathStopped:
+            here, allowance = self.points[-1], self._allowance
+            if not (allowance.end and allowance.clustered):
+                raise
+            end = self.path.as_base(self.path.measured_from(here, allowance.end))
+            allowance.repeated = MOST_REPEATED
+            yield end, end.s in self._ahead()
+            yield from self._steps()
 
     def _refuse_loop(self, fold: Point) -> None:
         """Stop at a fold that was passed before. Two successive folds may be close, so the last one is not compared."""
@@ -435,7 +519,7 @@ class Walk:
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
         """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""
         events: list[tuple[Label, Point, bool]] = []
-        for event in instabilities(self.path, low, high):
+        for event in self._located(low, high):
             ends = self.goal.until in ("limit", event.kind)
             events.append((event.kind, event.point, ends))
             if ends:
@@ -443,8 +527,38 @@ class Walk:
         if self._by_arc and self.goal.targets:
             until, targets = self.goal.until in ("target", "limit"), self.goal.targets
             seen = [*self.points[-2:-1], low]
-            for end in (*(self.path.as_base(event) for label, event, _ in events if label == "fold"), high):
+            folds = (event for label, event, _ in events if label == "fold" and event.s != low.s)
+            for end in (*(self.path.as_base(fold) for fold in folds), high):
                 seen = [*seen[-2:], end]  # a target just below a fold is passed on both sides of it
                 for target, point in targets_between(self.path, self.goal.quantity, targets, self.goal.sense, seen):
                     events.append(("target", point, until and target == targets[-1]))
         return sorted(events, key=lambda item: abs(item[1].s - low.s))
+
+    def _located(self, low: Point, high: Point) -> Iterator[Instability]:
+        """Instabilities between two points; several that shorter steps do not part count as one."""
+        allowance, way = self._allowance, high.s - low.s
+        beyond = allowance.end is not None and (high.s - allowance.end.s) * way > 0
+        if beyond and not high.turned_from(low):
+            allowance.renew()  # shorter steps have passed the place: there was nothing on this path
+        try:
+            yield from instabilities(self.path, low, high, allowance=allowance)
+        except Clustered as e:
+            allowance.end, allowance.clustered = high, True
+            allowance.repeated += 1
+            shortest = abs(way) / 4 < self.path.options.smallest
+            if allowance.repeated <= MOST_REPEATED and not allowance.spent and not shortest:
+                raise
+            allowance.renew()
+            yield self._cluster(e.point, e.high)
+            behind = self.path.as_base(e.high)
+            yield from self._located(behind, self.path.measured_from(behind, high))
+        except PathStopped:
+            allowance.end, allowance.clustered = high, False
+            raise
+
+    def _cluster(self, low: Point, high: Point) -> Instability:
+        """Instabilities between two points as one: a fold if the amplitude turns back between them."""
+        name = self.path.name
+        point = replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
+        self.clusters.append((point, high))
+        return Instability(point, "fold" if low.dmu * high.dmu < 0 else "bifurcation")

@@ -171,7 +171,7 @@ class Scene:
         # matrices only find what touches
         faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
         stiff = self.model.contacts or faces
-        options = NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces) if stiff else None
+        options = NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces, corners=True) if stiff else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()

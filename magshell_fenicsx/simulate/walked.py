@@ -126,7 +126,8 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                     mode = ("symmetric" if crossing_at_point.symmetric else "asymmetric") if crossing_at_point else ""
                 if label == "fold":
                     fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
-                yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
+                said = cluster(stage.scene, walk, point)
+                yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable, said=said)
                 if abs(point.state.mu[path.name]) > furthest:
                     break
         except PathStopped as e:
@@ -240,7 +241,8 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
         for label, point in walk:
             for record in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
                 yield replace(record, branch=number)
-            yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
+            said = cluster(stage.scene, walk, point)
+            yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable, said=said)
     except PathStopped as e:
         lost = _why(stage.scene, path, e, walk.points)
     for record in _excluded(path, watch.end()):
@@ -284,6 +286,18 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Records of the points where excluded modes become unstable or stable."""
     for crossing in crossings:
         yield Record("bifurcation", path.name, crossing.point, crossing.label, excluded_pivots=crossing.unstable)
+
+
+def cluster(scene: Scene, walk: Walk, point: Point) -> str:
+    """What is said of instabilities that were not parted, at the point that stands for them; "" at any other."""
+    behind = next((high for low, high in walk.clusters if low is point), None)
+    if behind is None:
+        return ""
+    name, count = walk.path.name, abs(behind.negative_pivots - point.negative_pivots)
+    first, last = (amount(scene, name, end.state.mu[name]) for end in (point, behind))
+    if count > 1:
+        return f"instabilities in {count} directions between {first} and {last} are too close to be located one by one"
+    return f"a fold and another instability between {first} and {last} are too close to be located one by one"
 
 
 def amount(scene: Scene, name: str, value: float) -> str:

@@ -37,6 +37,26 @@ def stop() -> Toy:
     return Toy(gradient, hessian, 2)
 
 
+def rows_of_stops(places: list[float]) -> Toy:
+    """Two places in a row on springs of the stiffness 1; the second one, x, meets stops of the stiffness 3.
+
+    x - q + 3 (sum of x - X over the stops that it has met) = 0 and 2 q - x = load.
+    """
+
+    def forces(x: float) -> tuple[float, float]:
+        _, pressed, stiff = penalty(x - np.array(places), 3.0, 1e-9)
+        return float(np.sum(pressed)), float(np.sum(stiff))
+
+    def gradient(u: Vector) -> Vector:
+        q, x = u
+        return np.array([q + (q - x), x - q + forces(x)[0]])
+
+    def hessian(u: Vector) -> Vector:
+        return np.array([[2.0, -1.0], [-1.0, 1.0 + forces(u[1])[1]]])
+
+    return Toy(gradient, hessian, 2)
+
+
 def way_to_touch(here: State, guess: State) -> Ahead:
     """As shells have it in `simulate.onset`."""
     gap, way = X - here.u[1], guess.u[1] - here.u[1]
@@ -66,3 +86,18 @@ def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
     assert q == pytest.approx(X + 0.6 / K, abs=1e-4)
     pressed = penalty(np.array([x - X]), STIFF, SOFT)[1][0]
     assert pressed == pytest.approx(0.6 - f(X), rel=1e-4), "the stop bears what the spring does not"
+
+
+@pytest.mark.parametrize("places", [[0.4], [0.4, 0.3], [0.4, 0.3, 0.1]])
+def test_a_path_passes_corners_just_ahead(places: list[float]) -> None:
+    """Stops at parts of the shortest step ahead. Behind all n of them x = (load + 6 sum of X)/(1 + 6 n)."""
+    first, begin = 0.1, 0.5
+    shortest = 1e-3 * first
+    at = [begin + part * shortest for part in places]
+    newton = BorderedNewton(rows_of_stops(at), NewtonOptions(fresh=0.0, patience=7, corners=True))
+    path = Path(newton, "load", "arc", StepOptions(first, 4 * first, shortest))
+    start = path.start(State(np.array([begin, begin]), {"load": begin}))
+    *_, (label, point) = Walk(path, start, Goal("target", [3.0]))
+    x = (3.0 + 6 * sum(at)) / (1 + 6 * len(at))
+    assert label == "target"
+    assert point.state.u == pytest.approx([(3.0 + x) / 2, x], rel=1e-6)

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from continuation.toys import closed_loop, pitchfork, snap_back
+from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap_back
 
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Label, Walk
+from magshell_fenicsx.continuation.walk import Goal, Label, Walk, instabilities
 
 K, C = 0.4, 1.9
 FOLDS = 1 - 1 / np.sqrt(3), 1 + 1 / np.sqrt(3)
@@ -184,3 +184,67 @@ def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     assert np.sort(x)[:12] == pytest.approx(np.sort(exact), abs=1e-9)
     assert np.mean([p.iterations for p in found]) < 4
     assert np.all(np.diff(x) > 0)  # in the order of the path
+
+
+def along_column(toy: Toy, control: str, goal: Goal) -> Walk:
+    path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 1e-6))
+    u = np.zeros(toy.size)
+    u[0] = 0.7013
+    return Walk(path, path.start(State(u, {"load": u[0]})), goal)
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
+@pytest.mark.parametrize("count", [2, 6])
+def test_a_cluster_of_modes_is_passed(control: str, count: int) -> None:
+    """Modes 1e-9 apart, with no point within 1e-4 of them."""
+    toy, solves = column_of_modes(1e-9, 1e-4, count), list[float]()
+    tangent = toy.tangent
+    toy.tangent = lambda u, mu, stress=(): (solves.append(u[0]), tangent(u, mu, stress))[1]  # type: ignore[method-assign]
+    walk = along_column(toy, control, Goal("target", [1.5]))
+    labels = [label for label, _ in walk]
+    assert labels[-1] == "target"
+    assert labels.count("bifurcation") == 1
+    assert walk.points[-1].negative_pivots == count
+    ((low, high),) = walk.clusters
+    assert low.state.mu["load"] < 1 - 1e-4
+    assert high.state.mu["load"] > 1 + 1e-4
+    assert high.negative_pivots - low.negative_pivots == count
+    assert low.load_error == pytest.approx(high.state.mu["load"] - low.state.mu["load"])
+    assert low.load_error < 0.004  # no step over several modes is longer
+    assert len(solves) < 400
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
+def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> None:
+    toy, u = column_of_modes(1e-9, 1e-4, 2, 1.005), np.zeros(4)
+    u[0] = 0.9913
+    path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 0.02, several=0.03))
+    walk = Walk(path, path.start(State(u, {"load": u[0]})), Goal("points", steps=1))
+    events = [point for label, point in walk if label == "bifurcation"]
+    assert [point.negative_pivots for point in events] == [0, 2]
+    assert events[0] is walk.clusters[0][0]
+    assert events[1].state.mu["load"] == pytest.approx(1.005, rel=1e-8)
+
+
+@pytest.mark.parametrize("control", ["load", "arc"])
+def test_modes_too_close_to_part_count_as_one(control: str) -> None:
+    walk = along_column(column_of_modes(1e-9), control, Goal("limit"))
+    *_, (label, point) = walk
+    assert label == "bifurcation"
+    assert not walk.clusters
+    assert point.state.mu["load"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
+    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends at a fold."""
+    imperfection = 1e-5
+    newton = BorderedNewton(pitchfork(imperfection))
+    path, ends = Path(newton, "load", "load", StepOptions(0.4, 0.4, 1e-6)), []
+    for load in (0.8, 1.2):
+        v = min(np.roots([1, 0, 1 - load, -imperfection]), key=abs).real
+        ends.append(path.start(State(np.array([load + v**2 / 2, v]), {"load": load})))
+    assert [end.negative_pivots for end in ends] == [0, 1]
+    before = newton.factorisation.count
+    with pytest.raises(PathStopped, match="another branch"):
+        list(instabilities(path, *ends))
+    assert newton.factorisation.count - before < 400

@@ -117,6 +117,28 @@ def snap_back(k: float, c: float) -> Toy:
     return Toy(gradient, hessian, 3)
 
 
+def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2, *others: float) -> Toy:
+    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on, and at others.
+
+    So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in a shell.
+    """
+    first = np.array([*(1 + distance * np.arange(count)), *others])
+    count = len(first)
+
+    def gradient(x: Vector) -> Vector:
+        u, v = x[0], x[1:]
+        if abs(u - 1) < hidden:
+            return np.full(1 + count, np.nan)
+        return np.array([u - np.sum(v**2) / 2, *((first - u) * v + v**3)])
+
+    def hessian(x: Vector) -> Vector:
+        K = np.diag([1.0, *(first - x[0] + 3 * x[1:] ** 2)])
+        K[0, 1:] = K[1:, 0] = -x[1:]
+        return K
+
+    return Toy(gradient, hessian, 1 + count)
+
+
 def matrix(entries: np.ndarray) -> PETSc.Mat:
     """A symmetric matrix of PETSc's from all its entries."""
     n = len(entries)

@@ -1,0 +1,35 @@
+"""What is said of instabilities that a walk has passed without parting them, on modes whose loads are known."""
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from continuation.toys import column_of_modes
+
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import StepOptions
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.walk import Goal, Walk
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.walked import cluster
+
+WITHOUT_UNITS = cast("Scene", SimpleNamespace(sizes=SimpleNamespace(column=lambda name: None)))
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_one_sentence_names_directions_and_controls(count: int) -> None:
+    toy = column_of_modes(1e-9, 1e-4, count)
+    u = np.zeros(toy.size)
+    u[0] = 0.9
+    path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.03, 0.03, 1e-6))
+    walk = Walk(path, path.start(State(u, {"load": 0.9})), Goal("target", [1.1]))
+    sentences = [(point, said) for _, point in walk if (said := cluster(WITHOUT_UNITS, walk, point))]
+    ((point, said),) = sentences
+    first, last = (end.state.mu["load"] for end in walk.clusters[0])
+    assert said == (
+        f"instabilities in {count} directions between load = {first:.6g} and load = {last:.6g} "
+        "are too close to be located one by one"
+    )
+    assert point.state.mu["load"] == first < 1 < last
