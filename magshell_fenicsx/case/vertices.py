@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.distinct import NEAR, SAME_PLACE, told_apart
 from magshell_fenicsx.mesh.grading import Grading
-from magshell_fenicsx.mesh.grid import CLOSE, Grid, RimmedGrid
+from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.shape.ground import refuse_beside
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 CHART = 2  # coordinates of a place in a chart
+BESIDE_CURVE = 1e-3  # of the element size, at gmsh's edges, beside which it makes smaller elements
 FEWER = 0.7  # lines of a grid are nearer than places by up to this factor
 
 
@@ -81,26 +82,33 @@ def settled(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
     for point in points.values():
         if same(point):
             return point
-    for other in _on_edges(chart, drawn):
-        if same(other):
-            chart = other
+    if drawn.disc and same(np.zeros(CHART)):
+        return np.zeros(CHART)
+    for edge in edges_near(chart, drawn):  # one after the other: of two that meet at a corner too
+        on = edges_near(chart, drawn)[edge]
+        chart = on if same(on) else chart
     return chart
 
 
-def _on_edges(chart: Array, drawn: Outline) -> list[Array]:
-    """The nearest places of the edges, each with the coordinates of the ones before, and of a pole."""
+def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
+    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on them."""
     shape = drawn.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
         away = float(np.hypot(*chart))
-        return [0 * chart, *([chart * (shape.radius / away)] if away else [])]
+        return {shape.edge: chart * (shape.radius / away)} if away else {}
     if isinstance(shape, StripShape):
         low, high = np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
+        names, glued = ("root", "tip", "sides", "sides"), (False, False)
     else:
         assert isinstance(shape, Grid)
-        low, high = np.array(shape.low), np.array(shape.high)
-    nearest = np.where(chart - low < high - chart, low, high)
-    one, other = (np.where(np.arange(CHART) == axis, nearest, chart) for axis in range(CHART))
-    return [one, other, nearest]
+        low, high, names, glued = np.array(shape.low), np.array(shape.high), shape.sides, shape.glued
+    is_high = chart - low >= high - chart
+    nearest = np.where(is_high, high, low)
+    return {
+        names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
+        for axis in range(CHART)
+        if not glued[axis]
+    }
 
 
 @dataclass(frozen=True)
@@ -146,38 +154,35 @@ class Vertices:
         CaseError
             With both places.
         """
-        if isinstance(shape, Grid):
-            self._refuse_beside_lines(shape, plane)
-        elif not isinstance(shape, DiscShape | StripShape | RimmedGrid):
+        if not isinstance(shape, Grid | DiscShape | StripShape | RimmedGrid):
             return  # vertices of a file stay where they are
+        for name in self.points:
+            self._refuse_beside_edges(name, shape, plane)
         places = list(self.points.values())
         taken = shape.vertices_of(places) if isinstance(shape, Grid) else None
         for (i, one), (j, other) in combinations(enumerate(self.points), 2):
             apart = float(np.hypot(*(places[i] - places[j])))
             near = (taken[i] == taken[j]).all() if taken is not None else apart < NEAR * self.size(places[i])
             if near and not np.array_equal(places[i], places[j]):
-                self._refuse(one, self._place(places[j]), f"{self._key(other)}: [{{}}]", "give one of them")
+                self._refuse(one, self._place(places[j]), f"{self._key(other)}: [{{}}]", "give one of them", NEAR)
 
-    def _refuse_beside_lines(self, grid: Grid, plane: Mirror | None) -> None:
-        """See that no point is beside an edge or a plane of symmetry of a grid, but not on it."""
-        for name, chart in self.points.items():
-            near = NEAR * min(grid.size_at(axis, float(chart[axis])) for axis in range(CHART))
-            (place,) = self.drawn.embedding(chart[None])
-            for side in plane.sides.values() if plane else ():
-                off = float(side.beyond(place))
-                if ROUNDING < abs(off) < near:
-                    on = self._told(place - off * side.normal)
-                    self._refuse(name, on, "the plane of symmetry at [{}]", "put it there, or take symmetry: none")
-            for axis in range(CHART):
-                line = grid.beside(axis, float(chart[axis]))
-                ends = (grid.low[axis], grid.high[axis])
-                if line not in ends or grid.glued[axis] or abs(chart[axis] - line) <= CLOSE * np.subtract(*ends[::-1]):
-                    continue
-                on = self._place(np.where(np.arange(CHART) == axis, line, chart))
-                edge = grid.sides[2 * axis + ends.index(line)]
-                self._refuse(name, on, f"the edge {edge} at [{{}}]", "put it there")
+    def _refuse_beside_edges(self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
+        """See that a point is not beside an edge or a plane of symmetry, but on it or away from it."""
+        chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
+        size = self.size(chart)
+        if isinstance(shape, Grid):
+            size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
+        (place,) = self.drawn.embedding(chart[None])
+        for side in plane.sides.values() if plane else ():
+            off = float(side.beyond(place))
+            if ROUNDING < abs(off) < factor * size:
+                on, hint = self._told(place - off * side.normal), "put it there, or take symmetry: none"
+                self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
+        for edge, on in edges_near(chart, self.drawn).items():
+            if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:
+                self._refuse(name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor)
 
-    def _refuse(self, name: str, other: Array, what: str, hint: str) -> None:
+    def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which stands in `what`."""
         chart = self.points[name]
         one, two = self._place(chart), other
@@ -185,7 +190,7 @@ class Vertices:
         apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
         raise CaseError(
             f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, too near for elements "
-            f"of {size:.3g}{self.unit}: {hint}, or take elements below {FEWER * apart / NEAR:.2g}{self.unit}"
+            f"of {size:.3g}{self.unit}: {hint}, or take elements below {FEWER * apart / factor:.2g}{self.unit}"
         )
 
     def _key(self, name: str) -> str:

@@ -18,7 +18,7 @@ NEAR = 0.02  # of the element size: with nearer vertices cells are too flat; wit
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
 FLAT = 25.0  # `flatness` from where meshes of the default penalty may be unstable: 26 to 37 in grids, 32 to 47 by gmsh
-TOO_FLAT = 1000.0  # `flatness` that the default penalty never stands
+TOO_FLAT = 2000.0  # `flatness` with which the count of unstable directions is not certain either
 
 
 def gathered(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
@@ -75,48 +75,45 @@ def flatness(patch: PatchMesh) -> Array:
     return np.asarray(np.nan_to_num(ratios, nan=np.inf).reshape(3, -1).sum(axis=0))
 
 
-def flat_triangle(patch: PatchMesh, penalty: float, default: float) -> str:
+def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: float, words: str) -> str:
     """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none is.
 
     Parameters
     ----------
     penalty, default
         The factor of the interior penalty, and that of its degree by default.
+    length
+        R in the coordinates of the message, which `words` name.
     """
-    return _flat(patch, penalty, default, FLAT)
+    flat = flatness(patch)
+    worst = int(flat.argmax())
+    if flat[worst] * default <= FLAT * penalty:
+        return ""
+    places = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
+    x, y, z = places.mean(axis=0)
+    long = np.linalg.norm(places - places[[1, 2, 0]], axis=1).max()
+    low = np.linalg.norm(np.cross(places[1] - places[0], places[2] - places[0])) / long
+    return (
+        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {long:.3g} long, too flat "
+        "beside its neighbours: make triangles of like heights there, by moving the point, the edge or the rim that "
+        f"is near another one{_or_penalty(float(flat[worst]), default)}"
+    )
 
 
-def refuse_flat(patch: PatchMesh, penalty: float, default: float) -> None:
-    """See that no triangle is far too flat; parameters as of `flat_triangle`.
+def _or_penalty(flat: float, default: float) -> str:
+    """The penalty that stands triangles so flat, as a hint; empty where none does."""
+    if not flat < TOO_FLAT:
+        return ""
+    return f", or take mesh.penalty: {np.ceil(default * flat / FLAT / 100) * 100:g}"
+
+
+def refuse_flat(patch: PatchMesh, penalty: float, default: float, length: float, words: str, key: str) -> None:
+    """See that no triangle is so flat that no penalty helps; parameters as of `flat_triangle`.
 
     Raises
     ------
     MeshError
-        With the place of the flattest.
+        With the place of the flattest; the message begins with the key.
     """
-    if text := _flat(patch, penalty, default, TOO_FLAT):
-        raise MeshError(f"mesh: {text}")
-
-
-def _flat(patch: PatchMesh, penalty: float, default: float, most: float) -> str:
-    flat = flatness(patch)
-    worst = int(flat.argmax())
-    if flat[worst] * default <= most * penalty:
-        return ""
-    places = patch.embedding(patch.nodes[patch.cells[worst, :3]])
-    x, y, z = places.mean(axis=0)
-    lengths = np.linalg.norm(places - places[[1, 2, 0]], axis=1)
-    low = np.linalg.norm(np.cross(places[1] - places[0], places[2] - places[0])) / lengths.max()
-    return (
-        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), over R, is {low:.3g} R high and {lengths.max():.3g} R long, "
-        "too flat beside its neighbours: mesh that place with triangles of like sizes, or move the point, edge or rim "
-        f"that makes it, or take mesh.penalty: {_two_digits(default * flat[worst] / FLAT)}"
-    )
-
-
-def _two_digits(x: float) -> str:
-    """A number rounded upwards to two digits."""
-    if not np.isfinite(x):
-        return "larger"
-    unit = 10.0 ** (np.floor(np.log10(x)) - 1)
-    return f"{np.ceil(x / unit) * unit:g}"
+    if not flatness(patch).max() < TOO_FLAT * max(penalty / default, 1.0):
+        raise MeshError(f"{key}: {flat_triangle(patch, penalty, default, length, words)}")
