@@ -18,7 +18,7 @@ NEAR = 0.02  # of the element size: with nearer vertices cells are too flat; wit
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
 FLAT = 25.0  # `flatness` from where meshes of the default penalty may be unstable: 26 to 37 in grids, 32 to 47 by gmsh
-TOO_FLAT = 2000.0  # `flatness` with which the count of unstable directions is not certain either
+TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 
 
 def gathered(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
@@ -107,7 +107,7 @@ def _or_penalty(flat: float, default: float) -> str:
     return f", or take mesh.penalty: {np.ceil(default * flat / FLAT / 100) * 100:g}"
 
 
-def refuse_flat(patch: PatchMesh, penalty: float, default: float, length: float, words: str, key: str) -> None:
+def refuse_flat(patch: PatchMesh, default: float, length: float, words: str, key: str) -> None:
     """See that no triangle is so flat that no penalty helps; parameters as of `flat_triangle`.
 
     Raises
@@ -115,5 +115,5 @@ def refuse_flat(patch: PatchMesh, penalty: float, default: float, length: float,
     MeshError
         With the place of the flattest; the message begins with the key.
     """
-    if not flatness(patch).max() < TOO_FLAT * max(penalty / default, 1.0):
-        raise MeshError(f"{key}: {flat_triangle(patch, penalty, default, length, words)}")
+    if not flatness(patch).max() < TOO_FLAT:
+        raise MeshError(f"{key}: {flat_triangle(patch, default, default, length, words)}")

@@ -299,7 +299,7 @@ class Problem:
         patch = self._made()
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         if not self.body:
-            refuse_flat(patch, *self._flat, "shell.file" if self._of_file else "mesh")
+            refuse_flat(patch, *self._flat[1:], "shell.file" if self._of_file else "mesh")
         return patch
 
     def flat_triangle(self, patch: PatchMesh) -> str:
