@@ -15,6 +15,7 @@ from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, set
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly
+from magshell_fenicsx.mesh.distinct import lines_of
 from magshell_fenicsx.mesh.grading import Disc, Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror, Sector, rotation
@@ -147,7 +148,7 @@ def make_problem(
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
-    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else (), size)
     span = drawn.span if axisymmetric else None
     if not axisymmetric:
         Vertices.of(case, points, drawn, size, turn).refuse_near(shape, beyond)
@@ -312,13 +313,14 @@ def imperfect(perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, 
     )
 
 
-def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size: Grading) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
-        return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
+        lines = lines_of(np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius))
+        return replace(shape, circles=tuple(lines), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 

@@ -40,6 +40,16 @@ def gathered(coordinates: Array, size: Callable[[float], float], rounding: float
     return [part for group in groups for part in _halved(group, max(rounding, WIDEST * size(float(group.mean()))))]
 
 
+def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]) -> list[float]:
+    """Return one coordinate for each of the `gathered` groups that lie between two ends and beside none of them."""
+
+    def inside(x: float) -> bool:
+        return min(x - ends[0], ends[1] - x) > max(SAME_PLACE, NEAR * size(x))
+
+    groups = gathered(np.array([x for x in coordinates if inside(float(x))]), size, SAME_PLACE)
+    return [float(group[0] + group[-1]) / 2 for group in groups]
+
+
 def _halved(group: Array, widest: float) -> list[Array]:
     """The group, or as many parts of it as have at most that width."""
     if np.ptp(group) <= widest:
