@@ -18,6 +18,7 @@ NEAR = 0.02  # of the element size: with nearer vertices cells are too flat; wit
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
 FLAT = 25.0  # `flatness` from where meshes of the default penalty may be unstable: 26 to 37 in grids, 32 to 47 by gmsh
+SHORT = 0.05  # a side over another one, from where its ends are told
 TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 
 
@@ -99,14 +100,18 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
     worst = int(flat.argmax())
     if flat[worst] * default <= FLAT * penalty:
         return ""
-    places = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
-    x, y, z = places.mean(axis=0)
-    long = np.linalg.norm(places - places[[1, 2, 0]], axis=1).max()
-    low = np.linalg.norm(np.cross(places[1] - places[0], places[2] - places[0])) / long
+    corners = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
+    x, y, z = corners.mean(axis=0)
+    sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
+    low = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
+    near = ""
+    if sides.min() < SHORT * sides.max():
+        side = int(sides.argmin())
+        one, other = told_apart(corners[side], corners[(side + 1) % 3])
+        near = f", with vertices at ({one}) and ({other})"
     return (
-        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {long:.3g} long, too flat "
-        "beside its neighbours: make triangles of like heights there, by moving the point, the edge or the rim that "
-        f"is near another one{_or_penalty(float(flat[worst]), default)}"
+        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {sides.max():.3g} long{near}"
+        f", too flat beside its neighbours: make triangles of like heights there{_or_penalty(float(flat[worst]), default)}"
     )
 
 
