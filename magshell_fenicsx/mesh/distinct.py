@@ -109,9 +109,10 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
         side = int(sides.argmin())
         one, other = told_apart(corners[side], corners[(side + 1) % 3])
         near = f", with vertices at ({one}) and ({other})"
+    hint = _or_penalty(float(flat[worst]), default)
     return (
         f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {sides.max():.3g} long{near}"
-        f", too flat beside its neighbours: make triangles of like heights there{_or_penalty(float(flat[worst]), default)}"
+        f", too flat beside its neighbours: make triangles of like heights there{hint}"
     )
 
 

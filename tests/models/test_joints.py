@@ -112,3 +112,11 @@ def test_an_edge_joins_another_shell() -> None:
     """An edge lies on its own shell always: that joint would join nothing."""
     with pytest.raises(CaseError, match="stiffener: is the shell of the edge itself"):
         Case.load(CASES / "stiffened_plate.yaml", ["joints=[{edges: [stiffener.bottom, stiffener]}]"])
+
+
+@pytest.mark.parametrize("stiffness", [2e6 * D / h, 1e9])
+def test_a_joint_too_stiff_is_refused(stiffness: float) -> None:
+    """A spring may be 1e6 times as stiff as the shell over its thickness, E h^2/(12 (1 - nu^2))."""
+    said = r"joints.0.stiffness: .* = 3.333e-05; allowed up to 1e\+06 times, 33.33: .* use kind: rigid"
+    with pytest.raises(CaseError, match=said):
+        deflected({"kind": "spring", "stiffness": stiffness})
