@@ -185,8 +185,8 @@ def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
     taken = dict[tuple[int, int], tuple[str, Array]]()
-    for (name, place), (i, j) in zip(points.items(), grid.vertices_of(places), strict=True):
-        before, at = taken.setdefault((int(i), int(j)), (name, place))
+    for (name, place), (i, j) in zip(points.items(), grid.vertices_of(places).tolist(), strict=True):
+        before, at = taken.setdefault((i, j), (name, place))
         off = place - vertices[i, j]
         off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
         apart = place - at - np.where(grid.glued, np.round((place - at) / extent) * extent, 0.0)
