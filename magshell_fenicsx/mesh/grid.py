@@ -107,11 +107,12 @@ class Grid:
         """Coordinates of lines that stay where they are, both ends among them."""
         low, high = self.low[axis], self.high[axis]
         lines = np.unique([low, high, *self.through[axis]])
-        return lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])]
+        return np.asarray(lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])])
 
     def beside(self, axis: int, x: float) -> float | None:
         """The straight line that a coordinate is too near to for a line of its own, or on; None if there is none."""
-        nearest = float(min(self._straight(axis), key=lambda line: abs(line - x)))
+        straight = self._straight(axis)
+        nearest = float(straight[np.abs(straight - x).argmin()])
         rounding = CLOSE * (self.high[axis] - self.low[axis])
         return nearest if abs(nearest - x) <= max(rounding, NEAR * self.size_at(axis, x)) else None
 
@@ -185,9 +186,10 @@ def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
     taken = dict[tuple[int, int], tuple[str, Array]]()
-    for (name, place), (i, j) in zip(points.items(), grid.vertices_of(places).tolist(), strict=True):
+    for (name, place), numbers in zip(points.items(), grid.vertices_of(places), strict=True):
+        i, j = int(numbers[0]), int(numbers[1])
         before, at = taken.setdefault((i, j), (name, place))
-        off = place - vertices[i, j]
+        off = np.asarray(place - vertices[i, j])
         off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
         apart = place - at - np.where(grid.glued, np.round((place - at) / extent) * extent, 0.0)
         if (np.abs(apart) > CLOSE * extent).any():
