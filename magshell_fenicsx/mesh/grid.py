@@ -186,8 +186,9 @@ def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
     taken = dict[tuple[int, int], tuple[str, Array]]()
-    for (name, place), numbers in zip(points.items(), grid.vertices_of(places), strict=True):
-        i, j = int(numbers[0]), int(numbers[1])
+    numbers = grid.vertices_of(places)
+    for which, (name, place) in enumerate(points.items()):
+        i, j = int(numbers[which, 0]), int(numbers[which, 1])
         before, at = taken.setdefault((i, j), (name, place))
         off = np.asarray(place - vertices[i, j])
         off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
