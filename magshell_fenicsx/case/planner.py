@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.meeting import Meeting
 from magshell_fenicsx.case.opened import changed, perfect_case
+from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, settled
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly
+from magshell_fenicsx.mesh.distinct import lines_of
 from magshell_fenicsx.mesh.grading import Disc, Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror, Sector, rotation
@@ -46,13 +48,11 @@ from magshell_fenicsx.problem.limits import unknowns_of
 from magshell_fenicsx.problem.names import refuse_unfit_ends, surface_terms
 from magshell_fenicsx.problem.problem import Awaited, Document, Problem, body_of
 from magshell_fenicsx.problem.sizes import Loaded, Shown, grading
-from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, sector, unit, unmirrored
 
 Array = NDArray[np.float64]
-Points = dict[str, Array]
 SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
 FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
@@ -107,10 +107,10 @@ def make_problem(
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
         turn, beyond = plane.azimuth, Sector.at(0.0, plane.waves) if isinstance(plane, Sector) else Y0
-    points = _named_points(case, drawn, turn, half)
+    points = named_points(case, drawn, turn, beyond)
     under = dict[str, str]()
     for name, (step, place) in places.items():
-        chart = step.load.chart_of(place, drawn, turn, half=half)
+        chart = settled(step.load.chart_of(place, drawn, turn, half=half), drawn, points)
         candidates = (point for point in ("pole", *under.values()) if point in points)
         same = (point for point in candidates if np.array_equal(points[point], chart))
         under[name] = next(same, name.replace("force", "load"))
@@ -131,7 +131,7 @@ def make_problem(
         varying, everywhere = of_imperfections(wide, perfect, turn, material.h)
         varying += refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
-    facing = [Meeting(_chart(rotation(turn) @ x, drawn, half=half)) for x in met]
+    facing = [Meeting(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
     shown: list[Shown] = [*local, *touched, *facing]
     size = grading(context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local))
     drawn = imperfect(perfect, imperfections, turn, still)
@@ -141,15 +141,17 @@ def make_problem(
         shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
-        x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
-        shape = replace(shape, through=(x, y))
+        x, y = ((*shape.loose[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, loose=(x, y))
     rims = different(local)
     if isinstance(beyond, Sector) and any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
-    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else (), size)
     span = drawn.span if axisymmetric else None
+    if not axisymmetric:
+        Vertices.of(case, points, drawn, size, turn).refuse_near(shape, beyond)
     conditions = edge_conditions(case.boundary, turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
@@ -318,13 +320,14 @@ def imperfect(perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, 
     )
 
 
-def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size: Grading) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
-        return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
+        lines = lines_of(np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius))
+        return replace(shape, circles=tuple(lines), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
@@ -397,28 +400,6 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         hint = "; each shell is held, and its own image in it" if case.several else hint
         raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
     return False, plane
-
-
-def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points:
-    """Named vertices in the chart, "pole" among them."""
-    Q, R = rotation(turn), case.shell.reference
-
-    def chart(name: str, x: Array) -> Array:
-        refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
-        return _chart(Q @ x, drawn, half=half)
-
-    points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
-    if points:
-        points["pole"] = next(iter(points.values()))
-    elif drawn.highest is not None:
-        points["pole"] = drawn.highest
-    return points
-
-
-def _chart(x: Array, drawn: Outline, *, half: bool) -> Array:
-    """That of a place (3,), of its image where the other half is modelled."""
-    places = drawn.inverse(x)
-    return drawn.on_half(places) if half else places
 
 
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.distinct import told_apart
 from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Mirror
 from magshell_fenicsx.mesh.patch import (
     Deviated,
@@ -27,6 +28,7 @@ from magshell_fenicsx.mesh.patch import (
 
 Array = NDArray[np.float64]
 MEET = 1e-5  # of the extent: how far vertices that meet may be apart; curved edges are that far from a coarse mesh
+SAME = 1e-12  # over R: places that differ by rounding
 NEARLY = 1e-5  # of a side: a place so near to its end is there
 ROUNDS = 40  # of the search for the nearest place of a side
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -286,7 +288,10 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     places = patch.nodes[:, :3]
     nearest = np.linalg.norm(places[away][:, None] - places[kept][None], axis=2).argmin(axis=1)
     if len(np.unique(nearest)) != len(kept):
-        raise MeshError(f"{key}: vertices of {' and '.join(edges)} nearly meet: give both shells the same mesh.size")
+        near = _nearest_two(places[kept], places[away])
+        raise MeshError(
+            f"{key}: vertices of {' and '.join(edges)} nearly meet, {near}, over R: give both shells the same mesh.size"
+        )
     to = np.arange(len(patch.one))
     to[away] = kept[nearest]
     joined = replace(patch, edges={name: to[pairs] for name, pairs in patch.edges.items()}, one=to[patch.one])
@@ -297,6 +302,16 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
             f"{key}: the normals of {edges[0]} and {edges[1]} point to opposite sides: turn one of the shells over"
         ) from None
     return joined
+
+
+def _nearest_two(kept: Array, away: Array) -> str:
+    """The two nearest places (n, 3) along an edge that are not one, with all digits that tell them apart."""
+    all_of_them = np.vstack([kept, away])
+    apart = np.linalg.norm(all_of_them[:, None] - all_of_them[None], axis=2)
+    apart[apart <= SAME] = np.inf
+    i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+    one, other = told_apart(all_of_them[i], all_of_them[j])
+    return f"at ({one}) and ({other})"
 
 
 def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tuple[float, Array]]:

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.distinct import NEAR, gathered
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
 from magshell_fenicsx.mesh.shapes import Faces, Glued, within
 
@@ -30,7 +32,9 @@ class Grid:
     glued
         Whether the two ends of each axis are one line of the surface.
     through
-        Coordinates across each axis at which there is a grid line.
+        Coordinates across each axis at which there is a straight grid line.
+    loose
+        Coordinates at which there is one too, that near places may draw to themselves.
     """
 
     low: tuple[float, float]
@@ -39,6 +43,7 @@ class Grid:
     sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
     glued: tuple[bool, bool] = (False, False)
     through: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    loose: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def edges(self) -> tuple[str, ...]:
@@ -53,8 +58,13 @@ class Grid:
     @property
     def cells(self) -> float:
         """Approximate number of triangles."""
-        quadrilaterals = [max(self._counted(axis)[1][-1], 1.0) for axis in range(2)]
+        quadrilaterals = [max(self._counts[axis][1][-1], 1.0) for axis in range(2)]
         return float(4 * quadrilaterals[0] * quadrilaterals[1])
+
+    @cached_property
+    def _counts(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Of both axes: see `_counted`."""
+        return self._counted(0), self._counted(1)
 
     def _counted(self, axis: int) -> tuple[Array, Array]:
         """Coordinates across an axis, and the number of sides of quadrilaterals up to each of them."""
@@ -65,13 +75,22 @@ class Grid:
         per_length = 1 / np.array([size(axis, float(c)) for c in x])
         return x, np.concatenate([[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))])
 
+    def size_at(self, axis: int, x: float) -> float:
+        """Largest distance of grid lines across an axis, at a coordinate."""
+        return self.size(axis, x) if callable(self.size) else self.size
+
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
-        """Coordinates of the grid lines across an axis: through every point, with distances up to the size."""
+        """Coordinates of the grid lines across an axis, with distances up to the size.
+
+        One is at every point, or near it where points nearly have the same coordinate.
+        """
         low, high = self.low[axis], self.high[axis]
-        given = np.unique([low, high, *self.through[axis], *(float(x[axis]) for x in points)])
+        straight = self._straight(axis)
+        loose = [middle for _, middle in self._gathered(axis, points)]
+        given = np.unique([*straight, *loose])
         given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
         given[-1] = high
-        x, sides = self._counted(axis)
+        x, sides = self._counts[axis]
         counts = np.interp(given, x, sides)
         parts = [max(int(np.ceil(b - a - 1e-6)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(parts) < 3:
@@ -83,6 +102,41 @@ class Grid:
                 between[:-1] = np.interp(np.linspace(first, last, n + 1)[1:-1], sides, x)
             inner.append(between)
         return np.concatenate([given[:1], *inner])
+
+    def _straight(self, axis: int) -> Array:
+        """Coordinates of lines that stay where they are, both ends among them."""
+        low, high = self.low[axis], self.high[axis]
+        lines = np.unique([low, high, *self.through[axis]])
+        return np.asarray(lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])])
+
+    def beside(self, axis: int, x: float) -> float | None:
+        """The straight line that a coordinate is too near to for a line of its own, or on; None if there is none."""
+        straight = self._straight(axis)
+        nearest = float(straight[np.abs(straight - x).argmin()])
+        rounding = CLOSE * (self.high[axis] - self.low[axis])
+        return nearest if abs(nearest - x) <= max(rounding, NEAR * self.size_at(axis, x)) else None
+
+    def _gathered(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
+        """Groups of coordinates that are near each other, beside no straight line, and the line of each."""
+        rounding = CLOSE * (self.high[axis] - self.low[axis])
+        given = np.unique([*(float(x[axis]) for x in points), *self.loose[axis]])
+        free = np.array([x for x in given if self.beside(axis, float(x)) is None])
+        groups = gathered(free, lambda x: self.size_at(axis, x), rounding)
+        return [(g, float(g[0] if np.ptp(g) <= rounding else (g[0] + g[-1]) / 2)) for g in groups]
+
+    def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
+        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the first."""
+        numbers = np.zeros((len(points), 2), dtype=np.int64)
+        for axis in range(2):
+            lines, groups = self.lines(axis, points), self._gathered(axis, points)
+            for i, point in enumerate(points):
+                x = float(point[axis])
+                line = self.beside(axis, x)
+                if line is None:
+                    line = next(middle for group, middle in groups if group[0] <= x <= group[-1])
+                number = int(np.abs(lines - line).argmin())
+                numbers[i, axis] = 0 if self.glued[axis] and number == len(lines) - 1 else number
+        return numbers
 
 
 def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> PatchMesh:
@@ -100,6 +154,7 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
     n, m = len(x) - 1, len(y) - 1
     vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    _draw(vertices, grid, points)
     centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
     nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
     number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
@@ -119,6 +174,38 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
             line = one[np.stack([row[:-1], row[1:]], axis=-1)]
             edges[name] = np.concatenate([edges[name], line]) if name in edges else line
     return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one)
+
+
+def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
+    """Move vertices (n, m, 2) to the points that take them, where lines are not exactly there.
+
+    Raises
+    ------
+    MeshError
+        If two points take one vertex, or one would draw a straight line.
+    """
+    extent, places = np.subtract(grid.high, grid.low), list(points.values())
+    taken = dict[tuple[int, int], tuple[str, Array]]()
+    numbers = grid.vertices_of(places)
+    for which, (name, place) in enumerate(points.items()):
+        i, j = int(numbers[which, 0]), int(numbers[which, 1])
+        before, at = taken.setdefault((i, j), (name, place))
+        off = np.asarray(place - vertices[i, j])
+        off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
+        apart = place - at - np.where(grid.glued, np.round((place - at) / extent) * extent, 0.0)
+        if (np.abs(apart) > CLOSE * extent).any():
+            raise MeshError(f"the points {before} and {name} are too near to each other for the elements there")
+        for axis in range(2):
+            line = grid.beside(axis, float(place[axis]))
+            end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
+            if abs(off[axis]) <= CLOSE * extent[axis]:
+                off[axis] = 0.0
+            elif line is not None and not end:
+                raise MeshError(f"the point {name} is too near to an edge or a plane of symmetry")
+        rows = (0, -1) if grid.glued[0] and i == 0 else (i,)
+        columns = (0, -1) if grid.glued[1] and j == 0 else (j,)
+        for copy in product(rows, columns) if before == name else ():
+            vertices[copy] += off
 
 
 @dataclass(frozen=True)
@@ -161,7 +248,7 @@ class RimmedGrid:
         near = [p for p in images if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()]
         surfaces = [rectangle(), *within(occ, near, rectangle)]
         for axis, other in ((0, 1), (1, 0)):
-            for across in self.grid.through[axis]:
+            for across in (*self.grid.through[axis], *self.grid.loose[axis]):
                 if not self.grid.low[axis] < across < self.grid.high[axis]:
                     continue
                 ends = np.array([self.grid.low, self.grid.high])

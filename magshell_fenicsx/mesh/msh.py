@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.branches import renamed, separated
+from magshell_fenicsx.mesh.distinct import told_apart
 from magshell_fenicsx.mesh.midsurface import nodal_normals
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
@@ -302,9 +303,9 @@ def _vertices(
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > NEAR * np.ptp(corners[:, :3], axis=0).max():
-            wanted, near = (place_text(np.divide(place, scale)) for place in (x, nearest))
+            wanted, near = told_apart(x[:3] / scale, nearest[:3] / scale)
             raise MeshError(
-                f"points.{name}: {wanted} in the file's coordinates is no vertex of the mesh; the nearest is {near}"
+                f"points.{name}: ({wanted}) in the file's coordinates is no vertex of the mesh; the nearest is ({near})"
             )
         vertices[name] = nearest
     return vertices

@@ -7,7 +7,7 @@ spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle the
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import inf, radians
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 AMPLITUDE = "fold"
+STIFFEST = 1e6  # over E h²/(12 (1 - ν²)), D/h: within 1e-6 of a rigid joint, and rounding costs as much
 
 
 class JointSection(Section):
@@ -95,6 +96,7 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         for i, section in enumerate(self.given):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
+                _refuse_too_stiff(i, section, context)
             if section.angle is not None and section.edges[1] in shells:
                 raise ValueError(
                     f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
@@ -129,6 +131,23 @@ class Joined(KeyAbility[Sequence[JointSection]]):
             for section in self.given
         )
         return {"joints": joints}
+
+
+def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
+    """See that a spring is not stiffer than rounding allows, beside the softer of its two shells."""
+    shells, softest = context.sections["shells"], inf
+    for edge in section.edges:
+        owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
+        for shell in (shells[name].shell for name in sorted(owners, key=len)[-1:]):
+            thickness = shell.reference / shell.R_over_h
+            softest = min(softest, (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2)))
+    stiffness = section.stiffness or 0.0
+    if stiffness > STIFFEST * softest:
+        raise ValueError(
+            f"joints.{number}.stiffness: {stiffness:g}: is {stiffness / softest:.2g} times that of the shell over its "
+            f"thickness, E h²/(12 (1 - ν²)) = {softest:.4g}; allowed up to {STIFFEST:g} times, "
+            f"{STIFFEST * softest:.4g}: a joint so stiff is rigid, use kind: rigid"
+        )
 
 
 def account(context: Context, loads: "Loads") -> Account:

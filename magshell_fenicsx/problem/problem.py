@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.distinct import flat_triangle, refuse_flat
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
 from magshell_fenicsx.mesh.hexahedra import MIDDLE
@@ -20,7 +21,7 @@ from magshell_fenicsx.mesh.shapes import DiscShape, Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.mesh.unfolding import doubled
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
-from magshell_fenicsx.models.shell.parameters import Condition, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
@@ -297,7 +298,26 @@ class Problem:
         """
         patch = self._made()
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
+        if not self.body:
+            refuse_flat(patch, *self._flat[1:], "shell.file" if self._of_file else "mesh")
         return patch
+
+    def flat_triangle(self, patch: PatchMesh) -> str:
+        """Say where a triangle is too flat for the penalty, and what helps; empty if none is."""
+        return flat_triangle(patch, *self._flat)
+
+    @property
+    def _of_file(self) -> "MeshFile | None":
+        """The mesh file of the one shell; None without."""
+        file = self.shape
+        return file if isinstance(file, MeshFile) and not file.given else None
+
+    @property
+    def _flat(self) -> tuple[float, float, float, str]:
+        """The penalty and that of the degree by default; how messages tell places."""
+        default = default_penalty(self.mesh.degree)
+        told = (1 / self._of_file.scale, "in the file's coordinates") if self._of_file else (1.0, "over R")
+        return self.mesh.penalty or default, default, *told
 
     def _triangulated(self, shape: Shape) -> PatchMesh:
         """The mesh of a shape by gmsh; that of a sector is symmetric, so that crests and troughs of waves are alike."""

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Direction, or_number
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.distinct import SAME_PLACE
 from magshell_fenicsx.mesh.mirror import rotation
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Distance = Callable[[Array], Array]  # places (n, 3) over R -> distances (n,) over R, from one place
 Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
-ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 ON_AXIS = 1e-9  # over R
 SEEN = 0.5  # of R: half of what is drawn of a body without end
 
@@ -191,9 +191,9 @@ def refuse_beside(key: str, x: Array, outline: "Outline", R: float, *, with_unit
     chart = outline.inverse(x)
     nearest = x if len(chart) == 3 else outline.embedding(chart[None])[0]
     perfect = outline.perfect(chart[None])[0] if len(chart) == 2 else x
-    if min(float(np.linalg.norm(place - x)) for place in (nearest, perfect)) > ON_SURFACE:
+    if min(float(np.linalg.norm(place - x)) for place in (nearest, perfect)) > SAME_PLACE:
         size, unit = (1e3 * R, " mm") if with_units else (R, "")
-        near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(nearest, 12))
+        near = ", ".join(f"{c * size + 0.0:.13g}{unit}" for c in np.round(nearest, 12))
         bare = "; a number without a unit is in metres here" if with_units else ""
         raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
 

@@ -61,9 +61,8 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         clock = thrown(scene, first_motion, state)
     yield Record("start", "", start, clock=clock, scene=scene, shown=scene.displacement)
     if pivots:
-        raise Stopped(
-            f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
-        )
+        why = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
+        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {why}")
     for name, value in own.items():
         rise = Walked(_under(scene, name, value, state))
         yield from (replace(risen, scene=scene, shown=scene.displacement) for risen in rise)

@@ -163,7 +163,7 @@ class Scene:
         self.loose = unsure and self.problem.at_rest
         motion = self.model.free_motion(self.unloaded().mu) if unsure and not self.loose else ""
         if motion and not self.problem.moves_freely:
-            raise MeshError(motion)
+            raise MeshError(f"mesh: {flat}" if (flat := self.flat_triangle) else motion)
         self.free_in_time = bool(motion)
         if motion:
             self.warnings.append(NOT_COUNTED)
@@ -198,6 +198,12 @@ class Scene:
         """The name of `problem` in earlier versions."""
         warn("Scene.plan is now Scene.problem", DeprecationWarning, stacklevel=2)
         return self.problem
+
+    @property
+    def flat_triangle(self) -> str:
+        """Where a triangle is too flat for the penalty, in words; empty if none is."""
+        surface = self.model.midsurface
+        return self.problem.flat_triangle(surface.patch) if surface and not self.problem.body else ""
 
     @property
     def cells(self) -> int:

@@ -142,3 +142,11 @@ def test_names_in_messages_are_those_of_the_case(tmp_path: Path, setting: str, m
     (tmp_path / "line.yaml").write_text(yaml.safe_dump(LINE), encoding="utf-8")
     with pytest.raises(CaseError, match=re.escape(message)):
         describe(Case.load(tmp_path / "line.yaml", [setting]))
+
+
+@pytest.mark.parametrize("stiffness", [2e6 * D / h, 1e9])
+def test_a_joint_too_stiff_is_refused(stiffness: float) -> None:
+    """A spring may be 1e6 times as stiff as the shell over its thickness, E h^2/(12 (1 - nu^2))."""
+    said = r"joints.0.stiffness: .* = 3.333e-05; allowed up to 1e\+06 times, 33.33: .* use kind: rigid"
+    with pytest.raises(CaseError, match=said):
+        deflected({"kind": "spring", "stiffness": stiffness})

@@ -11,6 +11,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.distinct import lines_of
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 from magshell_fenicsx.models.shell.patterns import places
 from magshell_fenicsx.platform import compat
@@ -234,7 +235,7 @@ def graded_vertices(
     end
         Value of the parameter at the outer edge.
     circles
-        Where the curvature jumps, rims of dimples: a vertex is put there.
+        Where the curvature jumps, rims of dimples: a vertex is put there, one for those that nearly meet.
     h
         Thickness over R, or the smaller size of the cells on the axis.
     largest
@@ -265,7 +266,8 @@ def graded_vertices(
             sizes = np.minimum(sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
         return sizes
 
-    corners = [0.0, *sorted({circle for circle in circles if circle < end}), end]
+    lines = lines_of(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))
+    corners = [0.0, *lines, end]
     return _equidistributed(corners, size)
 
 

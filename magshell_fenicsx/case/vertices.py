@@ -1,0 +1,204 @@
+"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and distinct."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.distinct import NEAR, SAME_PLACE, told_apart
+from magshell_fenicsx.mesh.grading import Grading
+from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
+from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.shape.ground import refuse_beside
+from magshell_fenicsx.shape.outline import Chart, Outline
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.case.case import Case
+
+Array = NDArray[np.float64]
+Points = dict[str, Array]
+CHART = 2  # coordinates of a place in a chart
+BESIDE_CURVE = 1e-3  # of the element size, at gmsh's edges, beside which it makes smaller elements
+FEWER = 0.7  # lines of a grid are nearer than places by up to this factor
+
+
+def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None) -> Points:
+    """Return the named vertices in the chart, "pole" among them.
+
+    Parameters
+    ----------
+    turn
+        The model's frame is turned about e3 by it (rad).
+    plane
+        The mirror plane or the sector of what is modelled, in the model's frame.
+
+    Raises
+    ------
+    CaseError
+        If one is not on the surface.
+    """
+    Q, R, points = rotation(turn), case.shell.reference, Points()
+    for name, place in case.points.items():
+        x = np.array(place) / R
+        refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
+        chart = chart_of(_on_planes(Q @ x, plane), drawn, half=plane is not None)
+        points[name] = settled(chart, drawn, points)
+    if points:
+        points["pole"] = next(iter(points.values()))
+    elif drawn.highest is not None:
+        points["pole"] = drawn.highest
+    return points
+
+
+def chart_of(x: Array, drawn: Outline, *, half: bool) -> Array:
+    """Return the chart of a place (3,), of its image where the other half is modelled."""
+    places = drawn.inverse(x)
+    return drawn.on_half(places) if half else places
+
+
+def _on_planes(x: Array, plane: Mirror | None) -> Array:
+    """A place (3,), moved onto planes of symmetry that it nearly is on."""
+    for side in plane.sides.values() if plane else ():
+        off = float(side.beyond(x))
+        x = x - off * side.normal if abs(off) <= SAME_PLACE else x
+    return x
+
+
+def settled(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
+    """Return that of the points which is at the same place as a chart (2 | 3,), or the chart, moved onto an edge or a
+    pole that it nearly is on."""
+    if len(chart) != CHART:
+        return chart
+    (place,) = drawn.embedding(chart[None])
+
+    def same(other: Array) -> bool:
+        return bool(np.linalg.norm(drawn.embedding(other[None])[0] - place) <= SAME_PLACE)
+
+    for point in points.values():
+        if same(point):
+            return point
+    if drawn.disc and same(np.zeros(CHART)):
+        return np.zeros(CHART)
+    for edge in edges_near(chart, drawn):  # one after the other: of two that meet at a corner too
+        on = edges_near(chart, drawn)[edge]
+        chart = on if same(on) else chart
+    return chart
+
+
+def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
+    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on them."""
+    shape = drawn.chart(None, Grading([], 1.0))
+    if isinstance(shape, DiscShape):
+        away = float(np.hypot(*chart))
+        return {shape.edge: chart * (shape.radius / away)} if away else {}
+    if isinstance(shape, StripShape):
+        low, high = np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
+        names, glued = ("root", "tip", "sides", "sides"), (False, False)
+    else:
+        assert isinstance(shape, Grid)
+        low, high, names, glued = np.array(shape.low), np.array(shape.high), shape.sides, shape.glued
+    is_high = chart - low >= high - chart
+    nearest = np.where(is_high, high, low)
+    return {
+        names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
+        for axis in range(CHART)
+        if not glued[axis]
+    }
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """Points that a mesh has vertices at, and how messages tell them.
+
+    Attributes
+    ----------
+    points
+        Name -> chart (2,).
+    drawn
+        The surface.
+    size
+        Element sizes over the chart.
+    turn
+        The model's frame is turned about e3 by it (rad).
+    R, unit
+        The reference length in messages, and their unit of lengths, empty without.
+    named
+        The names that stand in `points` of the case.
+    """
+
+    points: Mapping[str, Array]
+    drawn: Outline
+    size: Grading
+    turn: float
+    R: float
+    unit: str
+    named: Collection[str]
+
+    @classmethod
+    def of(cls, case: "Case", points: Mapping[str, Array], drawn: Outline, size: Grading, turn: float) -> "Vertices":
+        """Return those of a case."""
+        R, unit = (1e3 * case.shell.reference, " mm") if case.shell.with_units else (case.shell.reference, "")
+        order = sorted(points, key=lambda name: name not in case.points)  # "pole" may be one of them
+        return cls({name: points[name] for name in order}, drawn, size, turn, R, unit, case.points)
+
+    def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
+        """See that points are far enough from each other, from edges and from planes of symmetry.
+
+        Raises
+        ------
+        CaseError
+            With both places.
+        """
+        if not isinstance(shape, Grid | DiscShape | StripShape | RimmedGrid):
+            return  # vertices of a file stay where they are
+        for name in self.points:
+            self._refuse_beside_edges(name, shape, plane)
+        places = list(self.points.values())
+        taken = shape.vertices_of(places) if isinstance(shape, Grid) else None
+        for (i, one), (j, other) in combinations(enumerate(self.points), 2):
+            apart = float(np.hypot(*(places[i] - places[j])))
+            near = (taken[i] == taken[j]).all() if taken is not None else apart < NEAR * self.size(places[i])
+            if near and not np.array_equal(places[i], places[j]):
+                self._refuse(one, self._place(places[j]), f"{self._key(other)}: [{{}}]", "give one of them", NEAR)
+
+    def _refuse_beside_edges(self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
+        """See that a point is not beside an edge or a plane of symmetry, but on it or away from it."""
+        chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
+        size = self.size(chart)
+        if isinstance(shape, Grid):
+            size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
+        (place,) = self.drawn.embedding(chart[None])
+        for side in plane.sides.values() if plane else ():
+            off = float(side.beyond(place))
+            if ROUNDING < abs(off) < factor * size:
+                on, hint = self._told(place - off * side.normal), "put it there, or take symmetry: none"
+                self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
+        for edge, on in edges_near(chart, self.drawn).items():
+            if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:
+                self._refuse(name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor)
+
+    def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
+        """Refuse a point beside a place (3,) of the case, which stands in `what`."""
+        chart = self.points[name]
+        one, two = self._place(chart), other
+        here, there = (", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in told_apart(one, two))
+        apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
+        raise CaseError(
+            f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, too near for elements "
+            f"of {size:.3g}{self.unit}: {hint}, or take elements below {FEWER * apart / factor:.2g}{self.unit}"
+        )
+
+    def _key(self, name: str) -> str:
+        return f"points.{name}" if name in self.named else f"the point {name}"
+
+    def _place(self, chart: Array) -> Array:
+        return self._told(self.drawn.embedding(chart[None])[0])
+
+    def _told(self, x: Array) -> Array:
+        """A place (3,) over R of the model, in the case's frame and length."""
+        return np.asarray(x @ rotation(self.turn) * self.R)
