@@ -23,8 +23,7 @@ from magshell_fenicsx.platform import compat
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-SLOW = 0.3  # of the step before: a longer one may be due to that part, which is made anew if it is
-AWAY = 1.0  # in lengths: after a longer step it would soon be older again
+AWAY = 1.0  # in lengths: after a longer step that part would soon be older again if it were made anew
 FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
@@ -345,11 +344,11 @@ class Linearised:
         It is small beside the rest at that state, but need not be so now. After the step the residual is what the
         matrix lacks, times the step.
         """
-        before, size = [s.size for s in self._iterates.steps if s.own], matrix.size(step)
-        if not (self._tangent.rough and before and SLOW * before[-1] < size < AWAY):
+        before, size, hard = [s.size for s in self._iterates.steps if s.own], matrix.size(step), self._options.hard
+        if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):
             return False
         lacks = self._tangent.latest.change(step[0])
-        return lacks is not None and not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= SLOW * size
+        return lacks is not None and not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= hard * size
 
     def _serves(self, size: float) -> bool:
         """Whether a kept matrix serves that makes a next step of this size."""
