@@ -151,21 +151,12 @@ class Factorisation:
         self.negative_pivots += counted.more
         return True
 
-    def change(self, x: Vector) -> Vector | None:
-        """Return the product of x with what the older part of the latest tangent lacks, as foreseen; collective.
-
-        None if no part is older.
-        """
-        if not (self._rest and self._beside):
-            return None
-        rows = self._sparse_rows
-        product = self._beside.change(x[:rows])
-        return None if product is None else np.concatenate([product, np.zeros(len(x) - rows)])
-
-    @property
-    def _sparse_rows(self) -> int:
-        """Rows of K on this rank."""
-        return int(self.matrix.getLocalSize()[0])
+    def change(self, x: Vector) -> Vector:
+        """Return the product of x with what the older part of the latest tangent lacks, as foreseen; collective."""
+        change, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
+        if self._rest and self._beside:
+            change[:rows] = self._beside.change(x[:rows])
+        return change
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""

@@ -348,7 +348,7 @@ class Linearised:
         if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):
             return False
         lacks = self._tangent.latest.change(step[0])
-        return lacks is not None and not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= hard * size
+        return not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= hard * size
 
     def _serves(self, size: float) -> bool:
         """Whether a kept matrix serves that makes a next step of this size."""

@@ -51,10 +51,10 @@ class Beside:
     present: Callable[[Vector], Vector] | None = None
     foreseen: Callable[[Vector], Vector] | None = None
 
-    def change(self, v: Vector) -> Vector | None:
-        """Return the product of v with what is foreseen beyond the older part; None if nothing is older. Collective."""
+    def change(self, v: Vector) -> Vector:
+        """Return the product of v with what is foreseen beyond the older part; zero if nothing is older. Collective."""
         if self.foreseen is None or self.changing is None:
-            return None
+            return np.zeros_like(v)
         return np.asarray(self.foreseen(v) - self.changing.times(v))
 
 
