@@ -267,7 +267,7 @@ def _sums_of_rows(K: PETSc.Mat) -> Array:
     """Return the sum of magnitudes in each row of this rank."""
     starts, _, values = K.getValuesCSR()
     n = len(starts) - 1
-    return np.bincount(np.repeat(np.arange(n), np.diff(starts)), np.abs(values), n)
+    return np.asarray(np.bincount(np.repeat(np.arange(n), np.diff(starts)), np.abs(values), n), dtype=np.float64)
 
 
 def supports(
