@@ -266,8 +266,8 @@ def unresisted(rigid: Array, held: Callable[[Vector], Vector], tangent: Callable
 def _sums_of_rows(K: PETSc.Mat) -> Array:
     """Return the sum of magnitudes in each row of this rank."""
     starts, _, values = K.getValuesCSR()
-    n = len(starts) - 1
-    return np.asarray(np.bincount(np.repeat(np.arange(n), np.diff(starts)), np.abs(values), n), dtype=np.float64)
+    rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return np.asarray(np.bincount(rows, np.abs(values), len(starts) - 1), dtype=np.float64)
 
 
 def supports(
