@@ -321,7 +321,9 @@ class FiniteElementSystem:
         if self.of_all:
             K = self.of_all.beside(K, factors, rough=rough)
             if isinstance(K, Beside) and rough:
-                K = replace(K, present=self._present_of_all({t.name: factors[t.name] for t in self.of_all.terms}))
+                of_all = {t.name: factors[t.name] for t in self.of_all.terms}
+                present, foreseen = (self._present_of_all(of_all, rough=rough) for rough in (False, True))
+                K = replace(K, present=present, foreseen=foreseen)
             K = symmetric_part(K) if N or self.projection or self.noise else K
         if self.projection:
             K = self.projection.tangent(K)
@@ -329,8 +331,11 @@ class FiniteElementSystem:
             self.noise.on_matrix(K)
         return Skewed(K, N) if N else K
 
-    def _present_of_all(self, factors: Mapping[str, float]) -> Callable[[Vector], Vector]:
-        """The tangent of some terms, at the displacement that is set now, times a vector: by differences of forces."""
+    def _present_of_all(self, factors: Mapping[str, float], *, rough: bool) -> Callable[[Vector], Vector]:
+        """The tangent of some terms, at the displacement that is set now, times a vector: by differences of forces.
+
+        If `rough`, of forces that are foreseen.
+        """
         u = np.array(self.u.x.array)
 
         def times(v: Vector) -> Vector:
@@ -338,7 +343,7 @@ class FiniteElementSystem:
             before, product = np.array(self.u.x.array), np.zeros(self.size)
             for way in (1.0, -1.0):
                 self.u.x.array[:] = u + way * step * along
-                product += way / (2 * step) * self._summed(self._gradient(factors))
+                product += way / (2 * step) * self._summed(self._gradient(factors, rough=rough))
             self.u.x.array[:] = before
             return product
 

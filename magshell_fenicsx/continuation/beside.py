@@ -20,6 +20,7 @@ RUNS = 6  # with what was found before left out: eigenvalues may be multiple
 SURE = 0.1  # error of an eigenvalue over its distance from -1
 TOLERANCE, ACCEPTED = 1e-12, 1e-7  # of a solution's rest, over the first one; the second where rounding hides more
 ROUGH = 3e-2  # the first of these of a step of Newton's method
+SURELY = 0.5  # of the tangent: what is foreseen to lack of it does not change a sign, with an error as large as itself
 CORRECTED = 1.0  # a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
 FEW = 3  # if they are not more
 KEPT = 40  # products with D that are remembered
@@ -255,8 +256,11 @@ def doubted(tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vecto
         abs(dot(comm, x, changing.times(x)) / (dot(comm, x, y) + dot(comm, x, tangent.D.times(x))))
         for x, y in zip(X, KX, strict=True)
     ]
-    apart = Apart(X, KX, comm)
+    apart, change = Apart(X, KX, comm), tangent.change
     rest = max(least, largest(lambda v: apart.of(back(changing.times(apart.of(v)))), apart.of(first), comm))
+    if tangent.foreseen:  # the older part may be small where the present one is not
+        missed = largest(lambda v: apart.of(back(change(apart.of(v)))), apart.of(first), comm)
+        rest = max(rest, missed / SURELY)
     large = [i for i, doubt in enumerate(doubts) if not doubt <= CORRECTED]
     if tangent.present and rest <= CORRECTED and 0 < len(large) <= FEW:
         X, KX = ([each[i] for i in large] for each in (X, KX))

@@ -151,6 +151,13 @@ class Factorisation:
         self.negative_pivots += counted.more
         return True
 
+    def change(self, x: Vector) -> Vector:
+        """Return the product of x with what the older part of the latest tangent lacks, as foreseen; collective."""
+        change, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
+        if self._rest and self._beside:
+            change[:rows] = self._beside.change(x[:rows])
+        return change
+
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""
         if self._cholmod is None or not self._cholmod.is_of(K):

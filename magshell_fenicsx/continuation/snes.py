@@ -23,6 +23,7 @@ from magshell_fenicsx.platform import compat
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
+AWAY = 1.0  # in lengths: after a longer step that part would soon be older again if it were made anew
 FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
@@ -326,11 +327,31 @@ class Linearised:
         own = bool(steps) or not self._tangent.near(state, self._near)
         anew = sum(step.own for step in steps) == OLD and not self.foreseeing
         factors = self._tangent.at(state, self._stress, rough=not anew, sure=False) if own else self._tangent.latest
-        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangent.rough)
-        self.matrix, step = matrix, matrix.solve(*f, rough=True)
+        matrix, step = self._stepped(factors, state, f)
+        if own and self._too_old(matrix, step):
+            factors = self._tangent.at(state, self._stress, sure=False)
+            matrix, step = self._stepped(factors, state, f)
+        self.matrix = matrix
         self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
         steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))
         return step
+
+    def _stepped(self, factors: Factorisation, state: State, f: Direction) -> tuple[Bordered, Direction]:
+        """Return a matrix from some factors, and its step."""
+        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangent.rough)
+        return matrix, matrix.solve(*f, rough=True)
+
+    def _too_old(self, matrix: Bordered, step: Direction) -> bool:
+        """Return whether steps do not shrink because a part of the matrix is of an earlier state, as is foreseen.
+
+        It is small beside the rest at that state, but need not be so now. After the step the residual is what the
+        matrix lacks, times the step.
+        """
+        before, size, hard = [s.size for s in self._iterates.steps if s.own], matrix.size(step), self._options.hard
+        if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):
+            return False
+        lacks = self._tangent.latest.change(step[0])
+        return not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= hard * size
 
     def _serves(self, size: float) -> bool:
         """Whether a kept matrix serves that makes a next step of this size."""

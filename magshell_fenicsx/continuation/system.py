@@ -41,12 +41,21 @@ class Beside:
         What may be that of an earlier state: D and its part in K; D alone if None.
     present
         The product of that of the present state with a vector, dear; None if nothing is older. Collective.
+    foreseen
+        The same product as foreseen from states where forces are known, cheap; None if nothing is older. Collective.
     """
 
     K: PETSc.Mat
     D: Rest
     changing: Rest | None = None
     present: Callable[[Vector], Vector] | None = None
+    foreseen: Callable[[Vector], Vector] | None = None
+
+    def change(self, v: Vector) -> Vector:
+        """Return the product of v with what is foreseen beyond the older part; zero if nothing is older. Collective."""
+        if self.foreseen is None or self.changing is None:
+            return np.zeros_like(v)
+        return np.asarray(self.foreseen(v) - self.changing.times(v))
 
 
 @dataclass(frozen=True)

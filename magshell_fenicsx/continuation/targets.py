@@ -11,6 +11,10 @@ MOST_TRIALS = 20
 CLOSE = 1e-6  # of the way that is left between two places: nearer ones are the same
 
 
+class TargetMissed(PathStopped):
+    """The solve at a requested point between two points of the path failed."""
+
+
 def arriving(path: Path, quantity: Quantity, target: float, s: float, seen: Sequence[Point]) -> float:
     """The end of a step to `s`: close behind the last target, where points foresee that it is passed."""
     here = seen[-1].s
@@ -72,7 +76,7 @@ def _solved(path: Path, quantity: Quantity, target: float, around: Sequence[Poin
     end = high.state if len(counts) == 1 and abs(high.s - s) < 2 * (BEHIND - 1) * abs(high.s - low.s) else None
     point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress, near=end)
     if isinstance(point, str):
-        raise PathStopped(point, low)
+        raise TargetMissed(f"a requested point cannot be found: {point}", low)
     return point
 
 

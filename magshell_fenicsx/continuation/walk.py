@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical
 from magshell_fenicsx.continuation.path import SEEN, Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted, max_abs
-from magshell_fenicsx.continuation.targets import arriving, targets_between
+from magshell_fenicsx.continuation.targets import TargetMissed, arriving, targets_between
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
@@ -446,8 +446,9 @@ class Walk:
                             break
                 try:
                     between = self._between(low, point)
-                except PathStopped:  # the step had left the branch: approach in shorter steps
+                except PathStopped as e:  # the step had left the branch: approach in shorter steps
                     shorter, why = abs(point.s - low.s) / 4, "an instability cannot be located"
+                    why = str(e) if isinstance(e, TargetMissed) else why
                     break
                 for label, event, self.done in between:
                     yield label, event

@@ -1,47 +1,16 @@
 """Factors of the sparse part of K + D in place of those of all of it: dense eigenvalues and solutions by NumPy."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+from continuation.toys import Full, dense
 from mpi4py import MPI
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Beside, Rest
+from magshell_fenicsx.continuation.system import Beside
 
 Array = NDArray[np.float64]
 SIZE = 60
-
-
-@dataclass
-class Full:
-    """A `Rest` of one rank."""
-
-    D: Array
-
-    def times(self, v: Array) -> Array:
-        return self.D @ v
-
-    def scaled(self, factor: float) -> "Full":
-        return Full(factor * self.D)
-
-    def over(self, other: Rest) -> float:
-        return float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
-
-    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
-        n = len(self.D)
-        return matrix(self.D + K.getValues(range(n), range(n)))
-
-
-def matrix(values: Array) -> PETSc.Mat:
-    n = len(values)
-    K = PETSc.Mat().createAIJ([n, n], nnz=n, comm=MPI.COMM_SELF)
-    K.setValues(range(n), range(n), values)
-    K.assemble()
-    K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    return K
 
 
 def beside(soft: list[float], moved: float, noise: float) -> tuple[Array, Array]:
@@ -70,7 +39,7 @@ def test_inertia_and_solutions(soft: list[float], moved: float) -> None:
     """Negative pivots of K + D are its negative eigenvalues, and solutions those of NumPy, from factors of K."""
     K0, D = beside(soft, moved, 1e-5)
     factors, b = Factorisation(MPI.COMM_SELF), np.cos(np.arange(SIZE))
-    factors.factor(Beside(matrix(K0), Full(D)))
+    factors.factor(Beside(dense(K0), Full(D)))
     eigenvalues = np.linalg.eigvalsh(K0 + D)
     assert factors.doubt < np.inf, "K + D was factored itself"
     assert factors.negative_pivots == np.sum(eigenvalues < 0)
@@ -85,7 +54,7 @@ def test_what_is_not_small() -> None:
     """Where D is as large as K the sum is factored: the inertia is that of all entries."""
     K0, D = beside([], 0.0, 300.0)
     factors = Factorisation(MPI.COMM_SELF)
-    factors.factor(Beside(matrix(K0), Full(D)))
+    factors.factor(Beside(dense(K0), Full(D)))
     assert factors.doubt == np.inf
     assert factors.negative_pivots == np.sum(np.linalg.eigvalsh(K0 + D) < 0) > 0
 
@@ -101,8 +70,24 @@ def test_an_older_part_is_corrected_where_the_count_depends_on_it() -> None:
         return present @ v
 
     factors = Factorisation(MPI.COMM_SELF)
-    factors.factor(Beside(matrix(K), Full(D), Full(D), times))
+    factors.factor(Beside(dense(K), Full(D), Full(D), times))
     of_older, of_present = (int(np.sum(np.linalg.eigvalsh(K + each) < 0)) for each in (D, present))
     assert factors.negative_pivots == of_present != of_older
     assert factors.doubt < 1.0
     assert 0 < products <= 2
+
+
+@pytest.mark.parametrize("grown", [1.0, -0.05])
+def test_an_older_part_that_was_small_and_is_not_makes_no_count_certain(grown: float) -> None:
+    """D of an earlier state is noise beside K, that of the present is not: the eigenvalues of NumPy say of which.
+
+    Where D has kept its size the count is certain, where it has moved the softest eigenvalue past zero it is not.
+    """
+    K, D = beside([0.02], 0.0, 1e-6)
+    soft = np.linalg.eigh(K)[1][:, :1]
+    present = D if grown == 1.0 else D + grown * soft @ soft.T
+    factors = Factorisation(MPI.COMM_SELF)
+    factors.factor(Beside(dense(K), Full(D), Full(D), lambda v: present @ v, lambda v: present @ v))
+    of_older, of_present = (int(np.sum(np.linalg.eigvalsh(K + each) < 0)) for each in (D, present))
+    assert factors.negative_pivots == of_older == 0
+    assert (factors.doubt <= 1.0) == (of_present == of_older)

@@ -30,7 +30,7 @@ BESIDE = 1e-3  # largest distance from its plane at which curved elements leave 
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 NOT_HELD = "boundary: the shell is not held: it is free to "
-LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
+LOOSE = 1e-13  # of a rigid motion's energy, over that of the same displacements with all signs adding up: rounding
 
 
 def held_on(
@@ -255,8 +255,19 @@ def unresisted(rigid: Array, held: Callable[[Vector], Vector], tangent: Callable
         displacement.array[:] = motion
         K.mult(displacement, product)
         energies.append(comm.allreduce(free @ product.array))
-    values, vectors = np.linalg.eigh(np.array(energies))
-    return np.asarray(vectors.T[values < LOOSE * K.norm(PETSc.NormType.INFINITY)] @ free)
+    # what rounding leaves of an energy is a part of this, however stiff other shells of the same tangent are
+    bounds = comm.allreduce((free * _sums_of_rows(K)) @ free.T)
+    to_unit_bounds = np.linalg.inv(np.linalg.cholesky(bounds))
+    values, vectors = np.linalg.eigh(to_unit_bounds @ np.array(energies) @ to_unit_bounds.T)
+    loose = vectors.T[values < LOOSE] @ to_unit_bounds @ free
+    return np.asarray(loose / np.sqrt(comm.allreduce((loose**2).sum(axis=1)))[:, None])
+
+
+def _sums_of_rows(K: PETSc.Mat) -> Array:
+    """Return the sum of magnitudes in each row of this rank."""
+    starts, _, values = K.getValuesCSR()
+    rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return np.asarray(np.bincount(rows, np.abs(values), len(starts) - 1), dtype=np.float64)
 
 
 def supports(
