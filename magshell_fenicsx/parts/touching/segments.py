@@ -356,8 +356,12 @@ class Cuts:
     def numbered(self, u: Array) -> float:
         """The number of a displacement, the same for the same one."""
         number = float(int.from_bytes(hashlib.blake2b(np.array(u).tobytes(), digest_size=DIGITS).digest()))
-        self._displacements[number] = np.array(u)
+        self.recall(number, u)
         return number
+
+    def recall(self, number: float, u: Array) -> None:
+        """Let a number stand for a displacement."""
+        self._displacements[number] = np.array(u)
 
 
 def sides_of(triangles: Array) -> tuple[Array, Array]:

@@ -348,6 +348,10 @@ class Touching(ContactTerm):
         """The number of the present displacement, for cuts there; collective."""
         return self._cuts.numbered(self._now())
 
+    def recall(self, number: float) -> None:
+        """Let a number stand for the present displacement: it may be that of a run on other ranks; collective."""
+        self._cuts.recall(number, self._now())
+
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
         """The part of the force at points that do not face what they faced, or on what is `turned`."""
         other = at.of(points.faces[at.point] != at.cell)
