@@ -211,9 +211,8 @@ class Touching(ContactTerm):
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self._facing.found(self._now(), self._far, self._points)
-        least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
-        return least - self._h if np.isfinite(least) else np.nan
+        least = self._facing.least(self._now(), self._far, self._points)
+        return least - self._h if least < self._far else np.nan
 
     def penetration(self) -> float:
         """The largest, over R; 0 where nothing touches; collective."""
@@ -257,7 +256,7 @@ class Touching(ContactTerm):
         weight[: len(np.unique(points.cell))] -= 1.0
         p[: len(pushed)] = pushed
         np.add.at(p, points.cell[nearest.point] - start, size * (1 - alone / 2))
-        near = self._facing.found(self._now(), self._far, points)
+        near = self._facing.found(self._now(), self._far, points, least=True)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         pressed = np.zeros(count)
         some = np.unique(nearest.point)
@@ -280,8 +279,7 @@ class Touching(ContactTerm):
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        least = self._facing.found(self._of_copies(u), self._far).distance.min(initial=self._far)
-        return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
+        return self._facing.least(self._of_copies(u), self._far) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
