@@ -79,6 +79,7 @@ class Facing:
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._undeformed = np.column_stack([r0, self.half])
         self._known: tuple[Points, Array] = rule, self.x_of(rule, self._undeformed)
+        self._mine = np.unique(rule.cell)  # the cells of this rank that are modelled
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
@@ -98,7 +99,7 @@ class Facing:
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
         far = self._thickest
-        near = self._fit(*near_pairs(centres, radii, far), far, self._r0 + u, self._r0 + v)
+        near = self._fit(*near_pairs(centres, radii, far, self._mine), far, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -152,10 +153,7 @@ class Facing:
                 return pairs
         centres, radii = self._spheres(self._r0 + u)
         margin = reach + MARGIN * float(radii.mean())
-        i, j = self._fit(*near_pairs(centres, radii, margin), margin, self._r0 + u)
-        mine = np.zeros(len(centres), dtype=bool)
-        mine[self._rule.cell] = True
-        pairs = i[mine[i]], j[mine[i]]
+        pairs = self._fit(*near_pairs(centres, radii, margin, self._mine), margin, self._r0 + u)
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
@@ -208,16 +206,26 @@ class Facing:
         alike = faced == sizes
         return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
 
-    def _limits(self, points: Points, x: Array, r: Array, pairs: tuple[Longs, Longs]) -> Limits:
-        """How far the nearest place of a surface that is apart is at most: its nearest node is one."""
+    def _limits(
+        self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float
+    ) -> Limits:
+        """How far the nearest place of a surface that is apart is at most: its nearest node within `most` is one.
+
+        Parameters
+        ----------
+        asked, cell
+            (m,) of the points x, and their cells.
+        """
         number, apart = self._apart
         more = r[:, 3][self._cells.nodes] if r.shape[1] > 3 else np.zeros((1, 1))
         varies = highest(more, self._cells.lebesgue) + highest(-more, self._cells.lebesgue)
-        reach, surface = np.full(len(x), np.inf), number[points.cell]
+        reach, surface = np.full(len(x), np.inf), number[cell]
+        near = np.zeros(len(self._cells.nodes), dtype=bool)
+        near[pairs[1]] = True
         for each in np.unique(surface):
-            nodes = np.unique(self._cells.nodes[apart[each][number]])
+            nodes, mine = np.unique(self._cells.nodes[near & apart[each][number]]), asked[surface == each]
             if len(nodes):
-                away, _ = scipy.spatial.cKDTree(r[nodes, :3]).query(x[mine := surface == each, :3])
+                away, _ = scipy.spatial.cKDTree(r[nodes, :3]).query(x[mine, :3], distance_upper_bound=most)
                 reach[mine] = away + varies + 2 * SAME * self._h
         return Limits(apart[number[pairs[0]], number[pairs[1]]], reach)
 
@@ -236,7 +244,7 @@ class Facing:
             self._known = points, self.x_of(points, self._undeformed)
         near = self._is_beside(i * len(self._cells.nodes) + j)
         undeformed = Undeformed(near, self._undeformed, self._known[1], BESIDE)
-        limits = self._limits(points, x, r, (i, j)) if least else None
+        limits = self._limits(asked, x, r, (i, j), points.cell[asked], reach) if least else None
         return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed, limits)[1]
 
     def of_far_cells(self, points: Points, at: Places) -> Places:

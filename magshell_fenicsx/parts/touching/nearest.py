@@ -387,20 +387,23 @@ def determinant(A: Array) -> Array:
     return np.asarray(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
 
 
-def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs]:
-    """Pairs i != j of spheres that are nearer to each other than a reach, in classes of similar radii."""
+def near_pairs(centres: Array, radii: Array, reach: float, own: Longs) -> tuple[Longs, Longs]:
+    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes of similar radii."""
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
-    trees = [scipy.spatial.cKDTree(centres[each]) for each in classes]
+    owned = [own[size[own] == k] for k in np.unique(size)]
+    of_classes = [(each, scipy.spatial.cKDTree(centres[each])) for each in classes]
     pairs = list[tuple[Longs, Longs]]()
-    for a, first in enumerate(classes):
-        for b, second in enumerate(classes):
+    for first in filter(len, owned):
+        of_first = scipy.spatial.cKDTree(centres[first])
+        for second, of_second in of_classes:
             most = radii[first].max() + radii[second].max() + reach
-            near = trees[a].sparse_distance_matrix(trees[b], most, output_type="ndarray")
+            near = of_first.sparse_distance_matrix(of_second, most, output_type="ndarray")
             i, j = first[near["i"]], second[near["j"]]
             fits = (near["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[fits], j[fits]))
-    i, j = (np.concatenate(each).astype(np.int64) for each in zip(*pairs, strict=True))
+    nothing = np.zeros(0, dtype=np.int64)
+    i, j = (np.concatenate([nothing, *each]).astype(np.int64) for each in zip((nothing, nothing), *pairs, strict=True))
     return i, j
 
 

@@ -98,6 +98,7 @@ class Touching(ContactTerm):
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
+        self._cells_at = Kept[tuple[Array, Array, NDArray[np.bool_]]]()
         self._about: Expanded | None = None
         self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
 
@@ -237,6 +238,13 @@ class Touching(ContactTerm):
         return float(deep), np.asarray(place)
 
     def of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """See `_found_of_cells`; it is found once for a state. Collective."""
+        self._pressed()
+        if self._about:
+            return self._found_of_cells()
+        return self._cells_at.of((self._at, self.cuts.value, self._grown, self.stiffness.value), self._found_of_cells)
+
+    def _found_of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
         """The mean pressure over E h/R, the least gap over R within the reach, and which are pressed all over.
 
         Of local cells.
