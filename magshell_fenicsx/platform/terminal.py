@@ -56,7 +56,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Two functions: the first prints a line, the second rewrites the status line.
 
     If standard output is no terminal, or there are several ranks, the second prints a line where EACH seconds have
-    passed without one, and again after as many more. The status line is erased after `with`, and also when SIGTERM ends the process.
+    passed without one, and again after as many more. The status line is erased after `with`, and also when SIGTERM ends
+    the process.
     """
     if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         yield from _plain(say)

@@ -103,7 +103,7 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
 
 
 def recut(stage: Stage, high: Point) -> dict[str, float]:
-    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much better; else none."""
+    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much better there."""
     return better_cuts(stage.scene, stage.leave(high.state))
 
 

@@ -63,17 +63,17 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert [row[column] for row in again] == [row[column] for row in one]
 
 
-def pressed_caps(**mesh: Any) -> dict[str, Any]:
+def pressed_caps(down: float, points: int, **mesh: Any) -> dict[str, Any]:
     """The upper cap is pressed down on the lower one, which it soon touches."""
     shell = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.036, "poisson_ratio": 0.3}
     lower, upper = ({"shell": shell | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (6, 1))
     force = {"edge": "upper.hole", "force": [0, 0, -1]}
-    loading = {"kind": "dead", "control": "displacement", "until": "target", "loads": [force], "displacement": 0.03}
+    loading = {"kind": "dead", "control": "displacement", "until": "target", "loads": [force], "displacement": down}
     return {
         "shells": {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}},
         "contact": [["upper", "lower"]],
         "mesh": {"degree": 3, **mesh},
-        "loading": {**loading, "points": 3},
+        "loading": {**loading, "points": points},
     }
 
 
@@ -94,7 +94,7 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
     that the model excludes.
     """
     case, whole, killed = tmp_path / "case.yaml", tmp_path / "whole", tmp_path / "killed"
-    case.write_text(json.dumps(pressed_caps(**mesh) | {"symmetry": symmetry}))
+    case.write_text(json.dumps(pressed_caps(0.03, 3, **mesh) | {"symmetry": symmetry}))
     looks, at_end, record, following = list[str](), list[int](), Checkpoint.record, Checkpoint._next
 
     def recorded(journal: Checkpoint, result: Point | str) -> None:
@@ -123,6 +123,25 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
     rows = [[{**row, "wall_s": ""} for row in read_path(out)] for out in (killed, whole)]
     assert rows[0] == rows[1]
     assert len(rows[0]) > len(before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("symmetry", ["half", 6])
+def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> None:
+    """Just after the touch a half and a sector, on two ranks, have the force of the meridian, another discretisation."""
+    models = {
+        "meridian": (0, {"symmetry": "auto"}),
+        "other": (2, {"symmetry": symmetry, "mesh": {"size": 0.15, "degree": 3}}),
+    }
+    ends = list[dict[str, str]]()
+    for name, (ranks, model) in models.items():
+        (tmp_path / f"{name}.yaml").write_text(json.dumps(pressed_caps(0.015, 1) | model))
+        done = started("run", tmp_path / f"{name}.yaml", "--no-pictures", "--out", tmp_path / name, ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        ends.append(read_path(tmp_path / name)[-1])
+    assert float(ends[0]["contact_force"]) > 0
+    for column in ("load_factor", "contact_force", "energy"):
+        assert float(ends[1][column]) == pytest.approx(float(ends[0][column]), rel=5e-3), column
 
 
 @pytest.mark.slow

@@ -200,15 +200,15 @@ class Facing:
         joined = scipy.sparse.coo_array((np.ones(len(cell)), (cell, beyond)), (n, n))
         count, number = scipy.sparse.csgraph.connected_components(joined, directed=False)
         sizes, (_, first) = np.bincount(number), np.unique(number, return_index=True)
-        faced = np.array([np.bincount(number[self._allowed(np.full(n, i), np.arange(n))], minlength=count) for i in first])
+        faced = np.array(
+            [np.bincount(number[self._allowed(np.full(n, i), np.arange(n))], minlength=count) for i in first]
+        )
         near = np.zeros((count, count), dtype=bool)
         near[number[self._beside // n], number[self._beside % n]] = True
         alike = faced == sizes
         return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
 
-    def _limits(
-        self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float
-    ) -> Limits:
+    def _limits(self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float) -> Limits:
         """How far the nearest place of a surface that is apart is at most: its nearest node within `most` is one.
 
         Parameters
