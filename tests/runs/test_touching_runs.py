@@ -128,7 +128,7 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
 @pytest.mark.slow
 @pytest.mark.parametrize("symmetry", ["half", 6])
 def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> None:
-    """Just after the touch a half and a sector, on two ranks, have the force of the meridian, another discretisation."""
+    """Just after the touch a half and a sector on two ranks have the force of the meridian, another discretisation."""
     models = {
         "meridian": (0, {"symmetry": "auto"}),
         "other": (2, {"symmetry": symmetry, "mesh": {"size": 0.15, "degree": 3}}),
