@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyp
 from magshell_fenicsx.continuation.interpolated import flat_beyond, hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import (
+    Finding,
     Journal,
     NoJournal,
     NoProgress,
@@ -60,7 +61,7 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        What happens to forces on the straight way from a point to a first guess.
+        What happens to forces on the straight way from a point to a first guess; None if nothing does.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Path:
         scale: float = 1.0,
         journal: Journal | None = None,
         progress: Progress | None = None,
-        setting_in: Callable[[State, State], Ahead] = lambda here, guess: Ahead(),
+        setting_in: Callable[[State, State], Ahead] | None = None,
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
@@ -197,6 +198,17 @@ class Path:
         self._journal.record(result)
         return result
 
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        """What is found at points of the path, or was in an interrupted run at this place in the journal."""
+        return self._journal.noted(find)
+
+    def _ahead(self, here: State, guess: State) -> Ahead:
+        """What happens to forces on the straight way between two states."""
+        setting_in = self._setting_in
+        if setting_in is None:
+            return Ahead()
+        return Ahead(**self.noted(lambda: Finding(asdict(setting_in(here, guess)))).values)
+
     def on(self, state: State, direction: Direction, base: Point, negative_pivots: int) -> Point:
         """The point of a state on the path, with a given tangent of any length."""
         du, dmu = direction
@@ -284,10 +296,10 @@ class Path:
         seen, ahead = passed[-3:] if smooth else passed[-2:], Ahead()
         s = arrive(s, seen)
         if here is not course.vain:
-            ahead = self._setting_in(here.state, self.extended(s, seen))
+            ahead = self._ahead(here.state, self.extended(s, seen))
         if ahead.lets_go:  # others may meet on the way that its tangent foresees
             seen = passed[-1:]
-            ahead = self._setting_in(here.state, self.extended(s, seen))
+            ahead = self._ahead(here.state, self.extended(s, seen))
         return Plan(here.s + ahead.part * (s - here.s) if ahead.part < 1 else s, seen, length, ahead)
 
     def _tried(self, here: Point, plan: Plan) -> Point | Far | str:
@@ -398,7 +410,7 @@ class Path:
         """A point before forces set in, unless they did, or there is a corner."""
         if not isinstance(there, Point):
             return there
-        clear = self._setting_in(here.state, there.state).part == 1.0
+        clear = self._ahead(here.state, there.state).part == 1.0
         return there if clear and self._smooth(here, self.seen_from(here, there)) else TURNS
 
     def _corner(self, here: Point, there: Point) -> bool:

@@ -1,7 +1,8 @@
 """An accepted point of an equilibrium path, the record of points for a resumed run, and reports on the way."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -79,11 +80,27 @@ class StepTooLong(RuntimeError):
     """What lies between two points must not be: the step between them is to be shorter."""
 
 
+@dataclass(frozen=True)
+class Finding:
+    """What a history has seen at points that it has, where that costs as much as a solve.
+
+    Attributes
+    ----------
+    values
+        The same on all ranks: what JSON can hold.
+    vector
+        This rank's part of a vector; None without one.
+    """
+
+    values: Mapping[str, Any]
+    vector: Vector | None = None
+
+
 class Journal(Protocol):
-    """The results of `Path.recorded`, in their order.
+    """The results of `Path.recorded` and the findings of a history, in their order.
 
     A history is deterministic: from the same results it chooses the same steps, targets and brackets. So the
-    results are a complete checkpoint.
+    results are a complete checkpoint. What is found at these results follows from them, and is kept for its cost.
     """
 
     def replay(self) -> Point | str | None:
@@ -94,6 +111,12 @@ class Journal(Protocol):
 
     def record(self, result: Point | str) -> None:
         """Keep a result. Collective."""
+
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        """What `find` returns, or has returned here in an interrupted run. Collective.
+
+        The vector is None where that run had other ranks.
+        """
 
     def begin(self, space: object) -> None:
         """The results from here on are of another system, with the unknowns of that space. Collective."""
@@ -113,6 +136,9 @@ class NoJournal:
 
     def record(self, result: Point | str) -> None:
         pass
+
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        return find()
 
     def begin(self, space: object) -> None:
         pass

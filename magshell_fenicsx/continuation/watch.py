@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import pairwise
 from typing import Protocol
 
@@ -10,7 +11,7 @@ import numpy as np
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import Stability
 from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import Finding, PathStopped, Point
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.continuation.walk import locate_bifurcation
 
@@ -163,7 +164,7 @@ class _Look:
     softest, vector
         Magnitude of the eigenvalue nearest to zero of the only family, and its mode; None if there are several.
     numbers
-        The tangents of several families, see `Tangents`.
+        Gives the tangents of several families, see `Tangents`; None if there are none.
     """
 
     point: Point
@@ -171,7 +172,7 @@ class _Look:
     counts: tuple[int, ...]
     softest: float = np.inf
     vector: Vector | None = None
-    numbers: Vector | None = None
+    numbers: Callable[[], Vector] | None = None
 
 
 class Watch:
@@ -336,11 +337,13 @@ class Watch:
             return False
         if other is None or other.numbers is None or other.along in (low.along, high.along):
             return True
-        step = high.along - low.along
-        slopes = (high.numbers - low.numbers) / step, (low.numbers - other.numbers) / (low.along - other.along)
-        bend = (slopes[0] - slopes[1]) / (high.along - other.along)  # half the second derivative
-        between = (low.numbers + high.numbers) / 2 - step**2 / 2 * bend
-        return any(not low.counts[i] and not high.counts[i] for i in tangents.indefinite(between))
+        at, numbers = (other.along, low.along, high.along), (other.numbers, low.numbers, high.numbers)
+
+        def find() -> Finding:
+            indefinite = tangents.indefinite(_between_looks(at, [each() for each in numbers if each]))
+            return Finding({"recovers": any(not low.counts[i] and not high.counts[i] for i in indefinite)})
+
+        return bool(self._path.noted(find).values["recovers"])
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
         """The families that are unstable at the first point, and were not so on the path before."""
@@ -364,15 +367,23 @@ class Watch:
         return crossings
 
     def _look(self, point: Point, along: float) -> _Look:
-        state = self._expand(point.state)
-        if self._excluded and (tangents := self._excluded.tangents):
-            numbers = tangents.numbers(state)
-            return _Look(point, along, tuple(tangents.counts_of(numbers)), numbers=numbers)
-        if self._excluded is None or len(self._families) != 1:
-            return _Look(point, along, tuple(self._excluded.counts(state)) if self._excluded else ())
-        factors = self._families[0].factor_at(state)
-        softest, vector = _softest(factors, self._looked.vector if self._looked else None)
-        return _Look(point, along, (factors.negative_pivots,), softest, vector)
+        if self._excluded is None:
+            return _Look(point, along, ())
+        excluded, tangents, state = self._excluded, self._excluded.tangents, self._expand(point.state)
+        numbers = cache(partial(tangents.numbers, state)) if tangents else None
+        near = self._looked.vector if self._looked else None
+
+        def find() -> Finding:
+            if tangents and numbers:
+                return Finding({"counts": [*tangents.counts_of(numbers())], "softest": np.inf})
+            if len(self._families) != 1:
+                return Finding({"counts": [*excluded.counts(state)], "softest": np.inf})
+            factors = self._families[0].factor_at(state)
+            softest, vector = _softest(factors, near)
+            return Finding({"counts": [factors.negative_pivots], "softest": softest}, vector)
+
+        found = self._path.noted(find)
+        return _Look(point, along, tuple(found.values["counts"]), found.values["softest"], found.vector, numbers)
 
 
 @dataclass(frozen=True)
@@ -397,6 +408,15 @@ def _softest(factors: Factorisation, near: Vector | None) -> tuple[float, Vector
         v = factors.solve(v / np.sqrt(dot(comm, v, v)))
         size = 1 / np.sqrt(dot(comm, v, v))
     return size, size * v
+
+
+def _between_looks(along: Sequence[float], numbers: Sequence[Vector]) -> Vector:
+    """What a parabola through three has, in the mean, between the last two: its inner Bernstein coefficient there."""
+    (other, low, high), (before, first, last) = along, numbers
+    step = high - low
+    slopes = (last - first) / step, (first - before) / (low - other)
+    bend = (slopes[0] - slopes[1]) / (high - other)  # half the second derivative
+    return np.asarray((first + last) / 2 - step**2 / 2 * bend)
 
 
 def _rate(a: _Look, b: _Look) -> float | None:

@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,6 +15,7 @@ ERASED = "\r\x1b[K"
 ROOM = 3  # columns for the ^C of an interrupt; a full line would wrap and could not be erased
 COLUMNS = 79  # of a line that stays, in the narrowest usual terminal
 EACH = 30.0  # seconds without a line after which a pipe gets one
+LOOKS = 0.1  # of that, between two looks whether it is time
 lost: list[str] = []  # why standard output is not written
 # mpirun gives every rank a terminal, even if its own output is a file
 LAUNCHERS = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
@@ -54,7 +56,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Two functions: the first prints a line, the second rewrites the status line.
 
     If standard output is no terminal, or there are several ranks, the second prints a line where EACH seconds have
-    passed without one. The status line is erased after `with`, and also when SIGTERM ends the process.
+    passed without one, and again after as many more. The status line is erased after `with`, and also when SIGTERM ends
+    the process.
     """
     if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         yield from _plain(say)
@@ -83,19 +86,35 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
 
 
 def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
-    """Both functions print lines, the second seldom."""
-    last = time.monotonic()
+    """Both functions print lines, the second seldom; the last status is repeated while nothing else is said."""
+    last, status, lock, ended = time.monotonic(), ("", 0.0), threading.Lock(), threading.Event()
 
     def stay(line: str) -> None:
         nonlocal last
-        last = time.monotonic()
-        say(line)
+        with lock:
+            last = time.monotonic()
+            say(line)
 
     def seldom(line: str) -> None:
-        if time.monotonic() - last >= EACH:
+        nonlocal status
+        status = line, (now := time.monotonic())
+        if now - last >= EACH:
             stay(line)
 
-    yield stay, seldom
+    def repeat() -> None:
+        with suppress(BrokenPipeError):  # which ends the program where it prints next
+            while not ended.wait(LOOKS * EACH):
+                (line, told), now = status, time.monotonic()
+                if line and now - last >= (1 - LOOKS) * EACH:
+                    stay(f"{line}  (for {now - told:.0f} s)")
+
+    repeating = threading.Thread(target=repeat, daemon=True)
+    repeating.start()
+    try:
+        yield stay, seldom
+    finally:
+        ended.set()
+        repeating.join()
 
 
 def fitting(parts: Sequence[str], columns: int) -> str:

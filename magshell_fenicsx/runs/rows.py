@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.point import Finding
 from magshell_fenicsx.continuation.transient import FLOOR
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
@@ -29,7 +30,8 @@ class RowMaker:
     def row(self, record: Record, wall_s: float) -> Row:
         """The next row; `wall_s` is in seconds since the start of the history. Collective."""
         scene = record.scene or self._scene
-        values, point = scene.observe(record.point.state), record.point
+        point = record.point
+        values = self._scene.journal.noted(lambda: Finding(scene.observe(point.state))).values
         if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
             self._field_end = values["w_over_h"]
         self._count += 1

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.modes import NoEigenpair
-from magshell_fenicsx.continuation.point import Journal, NoJournal, Point
+from magshell_fenicsx.continuation.point import Finding, Journal, NoJournal, Point
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.report.report import write_report
@@ -133,6 +133,9 @@ class Stoppable:
 
     def record(self, result: Point | str) -> None:
         self._journal.record(result)
+
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        return self._journal.noted(find)
 
     def begin(self, space: object) -> None:
         self._journal.begin(space)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from magshell_fenicsx.continuation.path import SEEN, NotANumber
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.point import Finding, Point
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -14,7 +14,7 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import plain
 from magshell_fenicsx.simulate.steps import LOCATED, departure_of, followed_on, held_by, records_of
-from magshell_fenicsx.simulate.touch import refuse_penetration
+from magshell_fenicsx.simulate.touch import penetration_refused
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
 
 RISES = 4  # first steps of an energy that moves the undeformed shell
@@ -144,7 +144,10 @@ def _recorded(scene: Scene, step: ProgrammeStep, record: Record, remark: Callabl
     at = record.scene or scene
     if record.said:
         remark(where + record.said)
-    refuse_penetration(at, record.point.state, moving=bool((record.clock or {}).get("kinetic")))
+    state, moving = record.point.state, bool((record.clock or {}).get("kinetic"))
+    refused = scene.journal.noted(lambda: Finding({"said": penetration_refused(at, state, moving=moving)})).values
+    if refused["said"]:
+        raise Stopped(refused["said"])
     return replace(record, step=step.number, scene=at, shown=at.displacement)
 
 

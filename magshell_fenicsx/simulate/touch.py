@@ -72,13 +72,9 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     raise Stopped(f"no equilibrium found at the first contact: {reason}")
 
 
-def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
-    """The state of the first of two points with stiffer bodies where they penetrate too much at the second one.
-
-    None if none does, or if its stiffness is given.
-    """
-    raised = stiffnesses(stage.scene, stage.leave(high.state))
-    return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+def stiffer(stage: Stage, high: Point) -> dict[str, float]:
+    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given stiffness none."""
+    return stiffnesses(stage.scene, stage.leave(high.state))
 
 
 def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
@@ -108,30 +104,33 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
     return k
 
 
-def recut(stage: Stage, low: Point, high: Point) -> State | None:
-    """The state of the first of two points with the cuts of shells along each other's cells at the second one.
-
-    None if these would not be much better.
-    """
-    changed = better_cuts(stage.scene, stage.leave(high.state))
-    return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+def recut(stage: Stage, high: Point) -> dict[str, float]:
+    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much better there."""
+    return better_cuts(stage.scene, stage.leave(high.state))
 
 
-def resolved(stage: Stage, low: Point, high: Point) -> State | None:
-    """The state of the first of two points with closer points of contact, where an instability lies between them.
+def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
+    """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run; collective."""
+    at = stage.scene.model.system.at(stage.leave(high.state)) if numbers else None
+    for each in _with_cuts(stage.scene):
+        if at and each.pair.cuts in numbers:
+            at.of(partial(each.recall, numbers[each.pair.cuts]))
 
-    None if there is none, or if closer points change neither the number of unstable directions of both nor much of
+
+def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
+    """Return the numbers of cuts with closer points of contact, where an instability lies between two points.
+
+    Empty if there is none, or if closer points change neither the number of unstable directions of both nor much of
     their critical modes' stiffness: of an instability that they move, nobody knows whether it is one.
     """
     if not high.turned_from(low):
-        return None
+        return {}
     scene, state = stage.scene, stage.leave(high.state)
     at = scene.model.system.at(state)
     numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}
-    changed = {name: number for name, number in numbers.items() if number is not None}
-    if not changed or all(_certain(stage, point, changed) for point in (high, low)):
-        return None
-    return State(low.state.u, {**low.state.mu, **changed})
+    closer = {name: number for name, number in numbers.items() if number is not None}
+    certain = not closer or all(_certain(stage, point, closer) for point in (high, low))
+    return {} if certain else closer
 
 
 def _certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
@@ -296,20 +295,17 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
             raise PathStopped(said, high, final=True)
 
 
-def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> None:
-    """See that no body penetrates more than its bound, and no shell; where these hit each other in a motion, `IMPACT`.
+def penetration_refused(scene: Scene, state: State, *, moving: bool = False) -> str:
+    """How a body penetrates more than its bound, or a shell, and the stiffness that would halve it; "" if none does.
 
-    Raises
-    ------
-    Stopped
-        With the penetration and the stiffness that would halve it.
+    Where shells hit each other in a motion, their bound is `IMPACT` times as large. Collective.
     """
     h = scene.problem.material.h
     for contact in scene.problem.loads.contacts:
         deep = scene.model.region(state, contact.amplitude).penetration / h
         if deep > contact.bound:
             k = state.mu.get(contact.setting, contact.stiffness)
-            raise Stopped(
+            return (
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
                 f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
             )
@@ -319,8 +315,9 @@ def refuse_penetration(scene: Scene, state: State, *, moving: bool = False) -> N
             what = f"the penetration between {pair.words} is {deep:.3g} h, more than {bound:g} h"
             k = state.mu.get(pair.setting, pair.stiffness)
             if moving or pair.given:
-                raise Stopped(f"{what}; contact: stiffness: is {k:.4g}: give four times as much")
-            raise Stopped(f"{what} even with the stiffest penalty: take smaller elements where they touch")
+                return f"{what}; contact: stiffness: is {k:.4g}: give four times as much"
+            return f"{what} even with the stiffest penalty: take smaller elements where they touch"
+    return ""
 
 
 def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:

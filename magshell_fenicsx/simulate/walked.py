@@ -9,7 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import Branching, branching
 from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
+from magshell_fenicsx.continuation.point import Finding, PathStopped, Point, StepOptions, StepTooLong
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
@@ -18,13 +18,14 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import (
+    closer_points,
     of_its_own,
     passes,
+    recall_cuts,
     recut,
     refuse_crossing,
     refuse_passing,
     refuse_return,
-    resolved,
     stiffer,
 )
 
@@ -72,25 +73,66 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     """A walk on which bodies become stiffer, and shells are cut anew and get closer points where these move an
     instability; magnets on the way and returning bodies end it."""
-
-    cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
-
-    def checked(low: Point, high: Point) -> State | None:
-        nonlocal cut_at
-        refuse_crossing(stage, low, high)
-        refuse_passing(stage, low, high)
-        if goal.until != "points":
-            refuse_return(stage, path.name, walk.points, high)
-        if raised := stiffer(stage, low, high):
-            return raised
-        if low.s != cut_at:  # slid points are better than none
-            cut_at = low.s
-            if cut := recut(stage, low, high):
-                return cut
-        return resolved(stage, low, high)
-
-    walk = Walk(path, start, goal, checked)  # which `checked` looks at
+    checks = _Checks(stage, path, goal.until != "points")
+    checks.walk = walk = Walk(path, start, goal, checks)
     return walk
+
+
+class _Checks:
+    """What is seen to between each two successive points of a walk, as `renew` of a `Walk`.
+
+    Parameters
+    ----------
+    returns
+        Whether a body that goes back the way it came ends the walk.
+
+    Attributes
+    ----------
+    walk
+        The one that they are of.
+    """
+
+    walk: Walk
+
+    def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
+        self._stage, self._path, self._returns = stage, path, returns
+        self._cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
+
+    def __call__(self, low: Point, high: Point) -> State | None:
+        """See `Walk`.
+
+        Raises
+        ------
+        PathStopped, StepTooLong
+            If the second point must not follow the first one.
+        """
+        found = self._path.noted(partial(self._found, low, high)).values
+        if "too_long" in found:
+            raise StepTooLong(found["too_long"])
+        if "stopped" in found:
+            raise PathStopped(found["stopped"], high if found["at_high"] else low, final=found["final"])
+        changed, of_cuts = found["stiffer"], not found["stiffer"]
+        if of_cuts:
+            self._cut_at, changed = low.s, found["cuts"]
+            recall_cuts(self._stage, high, changed)
+        return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+    def _found(self, low: Point, high: Point) -> Finding:
+        """What is between two points: why the second one is refused, or the amplitudes that change."""
+        stage = self._stage
+        try:
+            refuse_crossing(stage, low, high)
+            refuse_passing(stage, low, high)
+            if self._returns:
+                refuse_return(stage, self._path.name, self.walk.points, high)
+        except StepTooLong as e:
+            return Finding({"too_long": str(e)})
+        except PathStopped as e:
+            return Finding({"stopped": str(e), "at_high": e.point is high, "final": e.final})
+        raised = stiffer(stage, high)
+        anew = not raised and low.s != self._cut_at  # slid points are better than none
+        cuts = recut(stage, high) if anew else {}
+        return Finding({"stiffer": raised, "cuts": cuts if raised or cuts else closer_points(stage, low, high)})
 
 
 def _followed(stage: Stage, walk: Walk, branches: int) -> Records:

@@ -203,6 +203,30 @@ def test_nearest_places() -> None:
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
 
 
+@pytest.mark.parametrize("thickness", [0.036, 0.024])
+def test_the_least_gap_of_shells_that_are_apart(thickness: float) -> None:
+    """As of the search for all places within the reach, in few of these; with the images of a sector."""
+    cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "poisson_ratio": 0.3, "youngs_modulus": 1}
+    lower, upper = ({"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, thickness))
+    shells = {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}}
+    loading = {"kind": "dead", "loads": [{"edge": "upper.hole", "force": [0, 0, -1]}], "until": "target", "factor": 1}
+    case = {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": 0.08, "degree": 3}, "loading": loading}
+    scene = Scene(Case.model_validate(case | {"symmetry": 6}))
+    (term,), system = scene.model.touchings, scene.model.system
+    assert isinstance(term, Mirrored)
+    u = system.held(2e-3 * np.random.default_rng(3).standard_normal(system.size))
+    at = system.at(State(u, scene.unloaded().mu))
+    facing, far, points = term._facing, term._far, at.of(lambda: term._pressed() and term._points)
+    every, few = (at.of(lambda least=least: facing.found(term._now(), far, points, least=least)) for least in (0, 1))
+    assert len(few.point) < 3 * len(points.cell) < len(every.point)
+    nearest = np.full((2, len(points.cell)), np.inf)
+    for distance, places in zip(nearest, (every, few), strict=True):
+        np.minimum.at(distance, places.point, places.distance)
+    assert np.isfinite(nearest).all()
+    assert nearest[1] == pytest.approx(nearest[0], abs=1e-13)
+    assert at.of(term.least_gap) == pytest.approx(nearest[0].min() - term._h, abs=1e-13)
+
+
 @pytest.mark.parametrize("deep", [1e-4, 3e-3, 0.2])
 def test_folds_between_cells_have_no_jump(deep: float) -> None:
     """On large cells some points are opposite a side, where their nearest place changes cells: differences 1e-6."""

@@ -23,6 +23,7 @@ from conftest import CASES
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
@@ -162,6 +163,23 @@ def test_a_pipe_gets_a_line_each_half_minute(monkeypatch: pytest.MonkeyPatch) ->
         say("a point at 69 s")
         tell("at 70 s")
     assert printed == ["at 31 s", "a point at 69 s"]
+
+
+def test_a_pipe_gets_the_last_status_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while long work tells nothing new, such as 90 s for one point; nothing before the first status."""
+    monkeypatch.setattr(terminal, "EACH", 0.1)
+    printed: list[str] = []
+    with live_line(2, printed.append) as (say, tell):
+        time.sleep(0.25)
+        say("begin")
+        tell("working")
+        time.sleep(0.35)
+    assert printed[0] == "begin"
+    assert 2 <= len(printed[1:]) <= 4
+    assert set(printed[1:]) == {"working  (for 0 s)"}
+    count = len(printed)
+    time.sleep(0.15)
+    assert len(printed) == count
 
 
 def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,21 @@
 """Runs in which a shell touches itself: on several ranks, and interrupted."""
 
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from command import all_started, read_path, started
+from command import all_started, magshell, read_path, started
 from conftest import CASES
 from interrupted import kill, start, wait_for_rows
+
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.output.store.checkpoint import Checkpoint
+from magshell_fenicsx.parts.touching.facing import Facing
+from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+from magshell_fenicsx.shells.waves import Waves
 
 THICK = [
     "--set=shell.thickness=0.08",
@@ -53,6 +61,87 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     again = read_path(tmp_path / "killed")
     for column in ("label", *EXACT):
         assert [row[column] for row in again] == [row[column] for row in one]
+
+
+def pressed_caps(down: float, points: int, **mesh: Any) -> dict[str, Any]:
+    """The upper cap is pressed down on the lower one, which it soon touches."""
+    shell = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.036, "poisson_ratio": 0.3}
+    lower, upper = ({"shell": shell | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (6, 1))
+    force = {"edge": "upper.hole", "force": [0, 0, -1]}
+    loading = {"kind": "dead", "control": "displacement", "until": "target", "loads": [force], "displacement": down}
+    return {
+        "shells": {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}},
+        "contact": [["upper", "lower"]],
+        "mesh": {"degree": 3, **mesh},
+        "loading": {**loading, "points": points},
+    }
+
+
+LOOKS = [(Facing, "places_in"), (MeridianTouching, "_found"), (Waves, "counts")]
+FEW = 4  # looks of the undeformed shells, and of the last point
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "mesh"),
+    [("auto", {"refinement": 0.3}), pytest.param("half", {"size": 0.15}, marks=pytest.mark.slow)],
+)
+def test_a_resumed_run_looks_at_no_known_contact_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pictures: None, symmetry: str, mesh: dict[str, Any]
+) -> None:
+    """The folder as it was at a moment after the touch, as kill -9 leaves it; the same rows to the last digit.
+
+    Where shells touch, what is found at points costs as much as the points: places that face each other, and modes
+    that the model excludes.
+    """
+    case, whole, killed = tmp_path / "case.yaml", tmp_path / "whole", tmp_path / "killed"
+    case.write_text(json.dumps(pressed_caps(0.03, 3, **mesh) | {"symmetry": symmetry}))
+    looks, at_end, record, following = list[str](), list[int](), Checkpoint.record, Checkpoint._next
+
+    def recorded(journal: Checkpoint, result: Point | str) -> None:
+        record(journal, result)
+        if len(read_path(whole)) > 3 and not killed.exists():
+            at_end.append(len(looks))
+            shutil.copytree(whole, killed)
+
+    def next_known(journal: Checkpoint) -> bytes | None:
+        content = following(journal)
+        if content is None:
+            at_end.append(len(looks))
+        return content
+
+    monkeypatch.setattr(Checkpoint, "record", recorded)
+    for kind, name in LOOKS:
+        own = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda *a, own=own, **b: (looks.append(own.__name__), own(*a, **b))[1])
+    assert magshell("run", case, "--out", whole).returncode == 0
+    before, looked = read_path(killed), at_end[-1]
+    assert any(float(row["contact_force"]) > 0 for row in before)
+    looks.clear(), at_end.clear()
+    monkeypatch.setattr(Checkpoint, "_next", next_known)
+    assert magshell("run", case, "--out", killed, "--resume").returncode == 0
+    assert at_end[0] <= FEW < looked / 2, looks[: at_end[0]]
+    rows = [[{**row, "wall_s": ""} for row in read_path(out)] for out in (killed, whole)]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) > len(before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("symmetry", ["half", 6])
+def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> None:
+    """Just after the touch a half and a sector on two ranks have the force of the meridian, another discretisation."""
+    models = {
+        "meridian": (0, {"symmetry": "auto"}),
+        "other": (2, {"symmetry": symmetry, "mesh": {"size": 0.15, "degree": 3}}),
+    }
+    ends = list[dict[str, str]]()
+    for name, (ranks, model) in models.items():
+        (tmp_path / f"{name}.yaml").write_text(json.dumps(pressed_caps(0.015, 1) | model))
+        done = started("run", tmp_path / f"{name}.yaml", "--no-pictures", "--out", tmp_path / name, ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        ends.append(read_path(tmp_path / name)[-1])
+    assert float(ends[0]["contact_force"]) > 0
+    for column in ("load_factor", "contact_force", "energy"):
+        assert float(ends[1][column]) == pytest.approx(float(ends[0][column]), rel=5e-3), column
 
 
 @pytest.mark.slow

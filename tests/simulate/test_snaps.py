@@ -1,13 +1,13 @@
 """Snaps of a dimpled hemisphere, the pressure held or the volume: at rest it is on a branch of the static path."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.point import Finding, Point
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.report.verdict import _snaps
 from magshell_fenicsx.runs.rows import columns, rows
@@ -80,6 +80,9 @@ class Kept:
     def record(self, found: Point | str) -> None:
         self.found.append(found)
         self._known.append(found)
+
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        return find()
 
     def check(self, known: bool) -> None:
         self._steps -= 1

@@ -1,4 +1,4 @@
-"""DIR/checkpoint: the case, then every result of the solver, each on disk before the next is computed.
+"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the next is computed.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through adios4dolfinx 0.9.3)
 raises on one rank in `Close` then, and the other ranks wait for ever.
@@ -8,6 +8,7 @@ import json
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,7 +19,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.point import Finding, Point
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
@@ -264,14 +265,39 @@ class Checkpoint:
 
     def replay(self) -> Point | str | None:
         """The next result in the file; None at its end."""
-        if not self._replaying:
-            return None
-        content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
+        content = self._next()
         if content is None:
-            self._replaying = False
             return None
         self.replayed += 1
         return self._decoded(content)
+
+    def _next(self) -> bytes | None:
+        """The next element of the file; None at its end."""
+        if not self._replaying:
+            return None
+        content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
+        self._replaying = content is not None
+        return content
+
+    def noted(self, find: Callable[[], Finding]) -> Finding:
+        """The next finding in the file; at its end that of `find`, which is put there."""
+        if content := self._next():
+            return self._read(content)
+        found = find()
+        parts = self._comm.gather(found.vector)
+        vectors = [part for part in parts or () if part is not None]
+        head = json.dumps({"values": found.values, "parts": [part.size for part in vectors]}, default=_plain)
+        self._append(b"\n".join([head.encode(), b"".join(part.tobytes() for part in vectors)]))
+        return found
+
+    def _read(self, content: bytes) -> Finding:
+        """A finding, with this rank's part of its vector if the ranks had as many values each."""
+        text, _, data = content.partition(b"\n")
+        decoded = json.loads(text)
+        parts, rank = decoded["parts"], self._comm.rank
+        if len(parts) != self._comm.size:
+            return Finding(decoded["values"])
+        return Finding(decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank])
 
     def record(self, result: Point | str) -> None:
         """Put a result on disk."""
@@ -316,6 +342,11 @@ class Checkpoint:
         if self._ordering.last:  # the numbers of a loading device
             u, du = (np.concatenate([v, more]) for v, more in zip((u, du), beyond, strict=True))
         return Point(State(u, decoded.pop("mu")), du=du, **decoded)
+
+
+def _plain(number: Any) -> Any:
+    """A number of NumPy as one of Python."""
+    return number.item()
 
 
 def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> bytes:

@@ -5,6 +5,7 @@ A tree gives the cells that are near, which are kept while nodes move little; Ne
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from magshell_fenicsx.parts.touching.nearest import (
     SHAPES,
     WAYS,
     Cells,
+    Limits,
     Longs,
     Places,
     Undeformed,
@@ -39,6 +41,7 @@ BLUR = 1e-6  # of the thickness: distances that differ by less belong to one pla
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
 SHRUNK = 0.9  # of the way between corners of cells beside each other, less than which they are apart where these fold
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
+NEARER_FIRST = 0.3, 0.5  # of a reach: whether a place is so near is asked first, which costs less
 SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
 
 
@@ -76,6 +79,7 @@ class Facing:
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._undeformed = np.column_stack([r0, self.half])
         self._known: tuple[Points, Array] = rule, self.x_of(rule, self._undeformed)
+        self._mine = np.unique(rule.cell)  # the cells of this rank that are modelled
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
@@ -95,7 +99,7 @@ class Facing:
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
         far = self._thickest
-        near = self._fit(*near_pairs(centres, radii, far), far, self._r0 + u, self._r0 + v)
+        near = self._fit(*near_pairs(centres, radii, far, self._mine), far, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -149,10 +153,7 @@ class Facing:
                 return pairs
         centres, radii = self._spheres(self._r0 + u)
         margin = reach + MARGIN * float(radii.mean())
-        i, j = self._fit(*near_pairs(centres, radii, margin), margin, self._r0 + u)
-        mine = np.zeros(len(centres), dtype=bool)
-        mine[self._rule.cell] = True
-        pairs = i[mine[i]], j[mine[i]]
+        pairs = self._fit(*near_pairs(centres, radii, margin, self._mine), margin, self._r0 + u)
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
@@ -170,14 +171,66 @@ class Facing:
 
         return between_held(held, self._cells.nodes, self._r0, u, self.half, may)
 
-    def found(self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True) -> Places:
+    def found(
+        self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True, least: bool = False
+    ) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement, within a distance of
-        faces or mid-surfaces."""
+        faces or mid-surfaces; with `least` those of each point's least distance, and some others."""
         points = points or self._rule
-        return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach))
+        return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach, least=least))
 
-    def places_in(self, points: Points, u: Array, r: Array, reach: float) -> Places:
-        """The places of all cells nearest to points, within a distance at a displacement; r as of `_placed`."""
+    def least(self, u: Array, far: float, points: Points | None = None) -> float:
+        """The least distance of any point at a displacement; `far` if none is nearer. Collective."""
+        for reach in (*(part * far for part in NEARER_FIRST), far):
+            mine = float(self.found(u, reach, points, least=True).distance.min(initial=far))
+            nearest = float(self._comm.allreduce(mine, MPI.MIN))
+            if nearest < reach:
+                return nearest
+        return far
+
+    @cached_property
+    def _apart(self) -> tuple[Longs, Inside]:
+        """The connected surface (n,) of each cell, and whether places of one face all of another one, (m, m).
+
+        Of another surface each point's nearest place counts: it goes on from there to none that is nearer, and no place
+        of it is near the point in the point's own surface.
+        """
+        cell, side = np.nonzero(self._cells.across >= 0)
+        n, beyond = len(self._cells.nodes), self._cells.across[cell, side]
+        joined = scipy.sparse.coo_array((np.ones(len(cell)), (cell, beyond)), (n, n))
+        count, number = scipy.sparse.csgraph.connected_components(joined, directed=False)
+        sizes, (_, first) = np.bincount(number), np.unique(number, return_index=True)
+        faced = np.array(
+            [np.bincount(number[self._allowed(np.full(n, i), np.arange(n))], minlength=count) for i in first]
+        )
+        near = np.zeros((count, count), dtype=bool)
+        near[number[self._beside // n], number[self._beside % n]] = True
+        alike = faced == sizes
+        return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
+
+    def _limits(self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float) -> Limits:
+        """How far the nearest place of a surface that is apart is at most: its nearest node within `most` is one.
+
+        Parameters
+        ----------
+        asked, cell
+            (m,) of the points x, and their cells.
+        """
+        number, apart = self._apart
+        more = r[:, 3][self._cells.nodes] if r.shape[1] > 3 else np.zeros((1, 1))
+        varies = highest(more, self._cells.lebesgue) + highest(-more, self._cells.lebesgue)
+        reach, surface = np.full(len(x), np.inf), number[cell]
+        near = np.zeros(len(self._cells.nodes), dtype=bool)
+        near[pairs[1]] = True
+        for each in np.unique(surface):
+            nodes, mine = np.unique(self._cells.nodes[near & apart[each][number]]), asked[surface == each]
+            if len(nodes):
+                away, _ = scipy.spatial.cKDTree(r[nodes, :3]).query(x[mine, :3], distance_upper_bound=most)
+                reach[mine] = away + varies + 2 * SAME * self._h
+        return Limits(apart[number[pairs[0]], number[pairs[1]]], reach)
+
+    def places_in(self, points: Points, u: Array, r: Array, reach: float, *, least: bool = False) -> Places:
+        """The places of all cells nearest to points, within a distance at a displacement; r as of `placed`."""
         thicker = highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
         of_faces, reach = reach, reach + 2 * thicker
         i, j = self._near_cells(u, reach)
@@ -191,7 +244,8 @@ class Facing:
             self._known = points, self.x_of(points, self._undeformed)
         near = self._is_beside(i * len(self._cells.nodes) + j)
         undeformed = Undeformed(near, self._undeformed, self._known[1], BESIDE)
-        return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed)[1]
+        limits = self._limits(asked, x, r, (i, j), points.cell[asked], reach) if least else None
+        return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed, limits)[1]
 
     def of_far_cells(self, points: Points, at: Places) -> Places:
         """Those in cells that are not near in the surface: others are not cut along each other."""

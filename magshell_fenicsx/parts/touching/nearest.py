@@ -41,8 +41,8 @@ FUNCTIONS = """
         const double *of, *undeformed, *coarse, *fine, *X, *bounds;
     } Cells;
     int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const uint8_t *,
-        const int64_t *, const double *, const double *, double, double, double, int64_t *, int64_t *,
-        double *, double *, double *, double *, uint8_t *);
+        const uint8_t *, const double *, const int64_t *, const double *, const double *, double, double, double,
+        int64_t *, int64_t *, double *, double *, double *, double *, uint8_t *);
     void places(int64_t, int64_t, const int64_t *, const int64_t *, const double *, const double *, double *);
 """
 
@@ -226,6 +226,22 @@ class Undeformed:
     apart: float
 
 
+@dataclass(frozen=True)
+class Limits:
+    """How far the nearest place of a point is at most, where no other one is asked for.
+
+    Attributes
+    ----------
+    bounded
+        (pairs,) whether places of these cells that are farther may be left out.
+    reach
+        (n,) of each point.
+    """
+
+    bounded: NDArray[np.bool_]
+    reach: Array
+
+
 def highest(values: Array, lebesgue: float) -> float:
     """A bound of polynomials with values (cells, functions) at nodes; Lebesgue's constant is that of the element."""
     most, least = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
@@ -247,6 +263,7 @@ def places_near(
     reach: float,
     within: float = np.inf,
     undeformed: Undeformed | None = None,
+    limits: Limits | None = None,
 ) -> tuple[Longs, Places]:
     """The places of cells nearest to points that are nearer than `within`, with the numbers of their pairs.
 
@@ -266,7 +283,9 @@ def places_near(
     cell, first, number, order = pairs
     used, which = np.unique(cell, return_inverse=True)
     nodal = r[cells.nodes[used]]
-    flat, where = nodal[..., :3], undeformed or Undeformed(np.zeros(len(cell), dtype=bool), r, x, 0.0)
+    nothing = np.zeros(len(cell), dtype=bool)
+    flat, where = nodal[..., :3], undeformed or Undeformed(nothing, r, x, 0.0)
+    to = limits or Limits(nothing, np.zeros(len(x)))
     centres = flat.mean(axis=1)
     radii = BULGE * np.linalg.norm(flat - centres[:, None], axis=2).max(axis=1)
     bounds = np.column_stack([centres, radii, *(BETWEEN / parts * radii for parts in LATTICES)])
@@ -278,7 +297,8 @@ def places_near(
     most = int(number.sum())
     point, pair = np.empty((2, most), dtype=np.int64)
     made = point, pair, *(np.empty((most, *shape)) for shape in SHAPES), np.empty(most, dtype=bool)
-    given = p(which.ravel(), first, number, where.near, order, _padded(x), _padded(where.x))
+    of_pairs = which.ravel(), first, number, where.near, to.bounded
+    given = p(*of_pairs, to.reach, order, _padded(x), _padded(where.x))
     count = lib.nearest(every, len(cell), *given, reach, within, where.apart, *p(*made))
     X, free, distance, way = (each[:count] for each in made[2:6])
     point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
@@ -367,20 +387,23 @@ def determinant(A: Array) -> Array:
     return np.asarray(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
 
 
-def near_pairs(centres: Array, radii: Array, reach: float) -> tuple[Longs, Longs]:
-    """Pairs i != j of spheres that are nearer to each other than a reach, in classes of similar radii."""
+def near_pairs(centres: Array, radii: Array, reach: float, own: Longs) -> tuple[Longs, Longs]:
+    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes of similar radii."""
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
-    trees = [scipy.spatial.cKDTree(centres[each]) for each in classes]
+    owned = [own[size[own] == k] for k in np.unique(size)]
+    of_classes = [(each, scipy.spatial.cKDTree(centres[each])) for each in classes]
     pairs = list[tuple[Longs, Longs]]()
-    for a, first in enumerate(classes):
-        for b, second in enumerate(classes):
+    for first in filter(len, owned):
+        of_first = scipy.spatial.cKDTree(centres[first])
+        for second, of_second in of_classes:
             most = radii[first].max() + radii[second].max() + reach
-            near = trees[a].sparse_distance_matrix(trees[b], most, output_type="ndarray")
+            near = of_first.sparse_distance_matrix(of_second, most, output_type="ndarray")
             i, j = first[near["i"]], second[near["j"]]
             fits = (near["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[fits], j[fits]))
-    i, j = (np.concatenate(each).astype(np.int64) for each in zip(*pairs, strict=True))
+    nothing = np.zeros(0, dtype=np.int64)
+    i, j = (np.concatenate([nothing, *each]).astype(np.int64) for each in zip((nothing, nothing), *pairs, strict=True))
     return i, j
 
 

@@ -412,8 +412,12 @@ class Cuts:
         """The number of a displacement with so many divisions, the same for the same ones."""
         digest = hashlib.blake2b(np.array(u).tobytes(), digest_size=DIGITS).digest()
         number = float(LEVELS * int.from_bytes(digest) + divisions)
-        self._displacements[number] = np.array(u)
+        self.recall(number, u)
         return number
+
+    def recall(self, number: float, u: Array) -> None:
+        """Let a number stand for a displacement."""
+        self._displacements[number] = np.array(u)
 
 
 def divisions_of(number: float) -> int:

@@ -99,6 +99,7 @@ class Touching(ContactTerm):
         self._points, self._places, self._left = rule, nowhere(), nowhere()
         self._joined = Joined.of(self._places, 1.0)
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
+        self._cells_at = Kept[tuple[Array, Array, NDArray[np.bool_]]]()
         self._about: Expanded | None = None
         self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
 
@@ -212,9 +213,8 @@ class Touching(ContactTerm):
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        places = self._facing.found(self._now(), self._far, self._points)
-        least = float(self._comm.allreduce(float(places.distance.min(initial=np.inf)), MPI.MIN))
-        return least - self._h if np.isfinite(least) else np.nan
+        least = self._facing.least(self._now(), self._far, self._points)
+        return least - self._h if least < self._far else np.nan
 
     def penetration(self) -> float:
         """The largest, over R; 0 where nothing touches; collective."""
@@ -239,6 +239,13 @@ class Touching(ContactTerm):
         return float(deep), np.asarray(place)
 
     def of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """See `_found_of_cells`; it is found once for a state. Collective."""
+        self._pressed()
+        if self._about:
+            return self._found_of_cells()
+        return self._cells_at.of((self._at, self.cuts.value, self._grown, self.stiffness.value), self._found_of_cells)
+
+    def _found_of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
         """The mean pressure over E h/R, the least gap over R within the reach, and which are pressed all over.
 
         Of local cells.
@@ -258,7 +265,7 @@ class Touching(ContactTerm):
         weight[: len(np.unique(points.cell))] -= 1.0
         p[: len(pushed)] = pushed
         np.add.at(p, points.cell[nearest.point] - start, size * (1 - alone / 2))
-        near = self._facing.found(self._now(), self._far, points)
+        near = self._facing.found(self._now(), self._far, points, least=True)
         np.minimum.at(gap, points.cell[near.point] - start, near.distance - self._h)
         pressed = np.zeros(count)
         some = np.unique(nearest.point)
@@ -281,8 +288,7 @@ class Touching(ContactTerm):
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        least = self._facing.found(self._of_copies(u), self._far).distance.min(initial=self._far)
-        return float(self._comm.allreduce(float(least), MPI.MIN)) - self._h
+        return self._facing.least(self._of_copies(u), self._far) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
@@ -368,6 +374,10 @@ class Touching(ContactTerm):
         points, normals = self._cuts.at(u, divisions)
         places = self._facing.found(u, self._h, points)
         return points, places.of(~self._facing.left_to_edges(points, places, normals))
+
+    def recall(self, number: float) -> None:
+        """Let a number stand for the present displacement: it may be that of a run on other ranks; collective."""
+        self._cuts.recall(number, self._now())
 
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
         """The part of the force at points that do not face what they faced, on what is `turned`, or where triangles
