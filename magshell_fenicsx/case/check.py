@@ -66,8 +66,8 @@ def _described(case: Case, problem: Problem) -> str:
         cells, unknowns = _count(problem, patch)
         refuse_overlap(problem, cells)
         lines.append(f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns")
-        if patch and not problem.body and (flat := problem.flat_triangle(patch)):
-            lines.append(f"mesh: may be unstable: {flat}")
+        if patch and not problem.body and (sliver := problem.flat_triangle(patch)):
+            lines.append(f"mesh: may be unstable: {sliver}")
         if patch and isinstance(problem.shape, MeshFile):
             lines += _surface(patch)
     else:

@@ -42,7 +42,8 @@ def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None
     CaseError
         If one is not on the surface.
     """
-    Q, R, points = rotation(turn), case.shell.reference, Points()
+    Q, R = rotation(turn), case.shell.reference
+    points: Points = {}
     for name, place in case.points.items():
         x = np.array(place) / R
         refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)

@@ -340,7 +340,7 @@ class Watch:
         at, numbers = (other.along, low.along, high.along), (other.numbers, low.numbers, high.numbers)
 
         def find() -> Finding:
-            indefinite = tangents.indefinite(_between_looks(at, [each() for each in numbers if each]))
+            indefinite = tangents.indefinite(_between_looks(at, [each() for each in numbers]))
             return Finding({"recovers": any(not low.counts[i] and not high.counts[i] for i in indefinite)})
 
         return bool(self._path.noted(find).values["recovers"])
