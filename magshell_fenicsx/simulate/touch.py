@@ -118,13 +118,11 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
-    """Return the numbers of cuts with closer points of contact, where an instability lies between two points.
+    """Return the numbers of cuts with closer points of contact, for two points with an instability between them.
 
-    Empty if there is none, or if closer points change neither the number of unstable directions of both nor much of
-    their critical modes' stiffness: of an instability that they move, nobody knows whether it is one.
+    Empty if closer points change neither the number of unstable directions of both nor much of their critical modes'
+    stiffness: of an instability that they move, nobody knows whether it is one.
     """
-    if not high.turned_from(low):
-        return {}
     scene, state = stage.scene, stage.leave(high.state)
     at = scene.model.system.at(state)
     numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}

@@ -97,6 +97,7 @@ class _Checks:
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
         self._cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
+        self._begin = np.nan, 0  # s of the first point, and its negative pivots before anything was changed there
 
     def __call__(self, low: Point, high: Point) -> State | None:
         """See `Walk`.
@@ -106,6 +107,8 @@ class _Checks:
         PathStopped, StepTooLong
             If the second point must not follow the first one.
         """
+        if low.s != self._begin[0]:
+            self._begin = low.s, low.negative_pivots
         found = self._path.noted(partial(self._found, low, high)).values
         if "too_long" in found:
             raise StepTooLong(found["too_long"])
@@ -132,7 +135,9 @@ class _Checks:
         raised = stiffer(stage, high)
         anew = not raised and low.s != self._cut_at  # slid points are better than none
         cuts = recut(stage, high) if anew else {}
-        return Finding({"stiffer": raised, "cuts": cuts if raised or cuts else closer_points(stage, low, high)})
+        turned = high.turned_from(low) or low.negative_pivots != self._begin[1]
+        closer = closer_points(stage, low, high) if turned and not (raised or cuts) else {}
+        return Finding({"stiffer": raised, "cuts": cuts or closer})
 
 
 def _followed(stage: Stage, walk: Walk, branches: int) -> Records:

@@ -6,7 +6,7 @@ from conftest import CASES
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 
-from magshell_fenicsx import Case
+from magshell_fenicsx import Case, Result
 from magshell_fenicsx.public import run
 
 Array = NDArray[np.float64]
@@ -63,3 +63,20 @@ def test_collapsing_tube() -> None:
     assert p[-1] * unit > 2 * meets
     assert gap[first:].min() > -1e-3
     assert max(row["contact_penalty"] for row in result.rows) == pytest.approx(1e6 / 12)  # no need to be stiffer
+    refuse_instabilities(result)
+
+
+@pytest.mark.slow
+def test_no_instability_of_the_points_of_contact() -> None:
+    """On another mesh too: the softest mode of the ring in contact slides, with a stiffness of +0.005 D/R^3.
+
+    The zone of contact is narrower than the distance of the points on cells, which would push the ring along with them.
+    """
+    refuse_instabilities(run(Case.load(CASES / "collapsing_tube.yaml", ["mesh.size=0.2"])))
+
+
+def refuse_instabilities(result: Result) -> None:
+    """See that a path has none."""
+    assert result.stopped is None
+    assert all(row["label"] not in ("fold", "bifurcation") for row in result.rows)
+    assert all(row["negative_pivots"] == 0 for row in result.rows)
