@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Loaded = tuple[Array, Sequence[Step]]  # place in the chart, and the loads there
 SOLID_DEGREE = 2
-RUBBER_LAYER = 0.35  # of h: elements at a clamped edge of rubber at any refinement, see docs/theory.md, Rubber
+RUBBER_LAYER = 0.35, 0.0035  # of h, and of R at least: elements at a clamped edge of rubber at any refinement
 LAYER_GROWTH = 1.0  # of elements away from there: the shell beside the layer is smooth
 
 
@@ -156,13 +156,22 @@ def _rim(context: Context, outline: "Outline", fit: Fit) -> list[Feature]:
     return [Ring(outline.edge, size * sqrt(h) / fit.refinement, _growth(context, fit))]
 
 
+def rubber_layer(h: float) -> float:
+    """Return the size over R of elements at a clamped edge of rubber, h over R: see docs/theory.md, Rubber.
+
+    The layer changes loads by some h/R, so that elements of thin shells need not be as small as it is.
+    """
+    of_h, of_R = RUBBER_LAYER
+    return max(of_h * h, of_R)
+
+
 def _clamped_rubber(context: Context, outline: "Outline", fit: Fit) -> list[Feature]:
     """Elements that show the layer in which stretched rubber bends at a clamped edge, about as wide as it is thick."""
     boundary = context.of(BoundarySection)
     held = boundary.conditions() if boundary else {}
     if not Rubber.of(context) or "clamped" not in held.values():
         return []
-    size = RUBBER_LAYER * fit.h
+    size = rubber_layer(fit.h)
     if outline.disc:
         return [Ring(outline.edge, size, LAYER_GROWTH)]
     if not (grid := outline.grid):
