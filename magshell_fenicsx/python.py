@@ -305,11 +305,12 @@ def _refuse_metres(extents: NDArray[np.float64], radius: float | str | None, thi
 
 
 def _in_metres(length: Any) -> float | None:
-    """A length that was given; None if it is none, which is refused elsewhere."""
+    """Return a length in metres; None if it is no positive one, which is refused elsewhere."""
     try:
-        return float(in_units("metre")(length)) or None
+        metres = float(in_units("metre")(length))
     except (TypeError, ValueError):
         return None
+    return metres if metres > 0 else None
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:

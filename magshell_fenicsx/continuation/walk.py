@@ -439,6 +439,7 @@ class Walk:
                 if state:
                     try:
                         self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                        self._allowance.end = None  # a point of the amplitudes before is not on this path
                         break
                     except PathStopped as e:
                         if self._renew and self._renew(low, point):  # nearer to the first point the change is smaller
@@ -483,7 +484,7 @@ class Walk:
             if not (allowance.end and allowance.clustered):
                 raise
             end = self.path.as_base(self.path.measured_from(here, allowance.end))
-            allowance.repeated = MOST_REPEATED
+            allowance.repeated, allowance.end = MOST_REPEATED, None  # where it is refused, the path has stopped
             yield end, end.s in self._ahead()
             yield from self._steps()
 

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.modes import critical_mode
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
@@ -134,9 +134,15 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
 
 
 def _certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
-    """Whether the critical mode's stiffness at a point is certain within `CERTAIN` of it, by closer points."""
+    """Return whether closer points change no critical mode's stiffness at a point by `CERTAIN` of it.
+
+    True as well if a mode is not found: then nothing says that closer points would help.
+    """
     given, other = point.state, State(point.state.u, {**point.state.mu, **finer})
-    mode, compared = (critical_mode(stage.newton, state) for state in (given, other))
+    try:
+        mode, compared = (critical_mode(stage.newton, state) for state in (given, other))
+    except NoEigenpair:
+        return True
     error = abs(compared.eigenvalue - mode.eigenvalue)
     return compared.negative_pivots == mode.negative_pivots and error < CERTAIN * abs(mode.eigenvalue)
 

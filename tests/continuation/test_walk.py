@@ -1,5 +1,7 @@
 """Walks by arc length on a toy with snap-through, snap-back and a pitchfork, all known in closed form."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap_back
@@ -7,7 +9,7 @@ from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions, StepTooLong
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Label, Walk, instabilities
 
@@ -224,6 +226,22 @@ def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> No
     assert [point.negative_pivots for point in events] == [0, 2]
     assert events[0] is walk.clusters[0][0]
     assert events[1].state.mu["load"] == pytest.approx(1.005, rel=1e-8)
+
+
+def test_a_cluster_that_must_not_be_passed_ends_the_walk() -> None:
+    """No step over it is allowed once it is known as one: the end of an earlier step is tried once, not for ever."""
+    walk = along_column(column_of_modes(1e-9, 1e-4), "load", Goal("target", [1.5]))
+    tried = list[float]()
+
+    def refused(low: Point, high: Point) -> None:
+        tried.append(high.s)
+        if low.state.u[0] < 1 < high.state.u[0] and walk._allowance.clustered:
+            raise StepTooLong("too long")
+
+    walk._renew = refused
+    with pytest.raises(PathStopped):
+        list(islice(walk, 1000))
+    assert len(tried) < 200
 
 
 @pytest.mark.parametrize("control", ["load", "arc"])

@@ -114,6 +114,11 @@ class Ordering:
             )
         return np.asarray(number)
 
+    @property
+    def is_present(self) -> bool:
+        """Whether the order in use is the present one: each rank has the nodes that it had in the file's run."""
+        return np.array_equal(np.concatenate(self._parts), np.arange(len(self.places)))
+
     def gather(self, u: Vector) -> Array:
         """All values (n, components) of a displacement on rank 0 of its space; empty on other ranks."""
         parts = self._within.gather(u)
@@ -291,11 +296,11 @@ class Checkpoint:
         return found
 
     def _read(self, content: bytes) -> Finding:
-        """A finding, with this rank's part of its vector if the ranks had as many values each."""
+        """Return a finding, with this rank's part of its vector if the ranks have the nodes that they had."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         parts, rank = decoded["parts"], self._comm.rank
-        if len(parts) != self._comm.size:
+        if len(parts) != self._comm.size or not self._ordering.is_present:
             return Finding(decoded["values"])
         return Finding(decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank])
 
