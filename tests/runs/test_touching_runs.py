@@ -81,10 +81,8 @@ LOOKS = [(Facing, "places_in"), (MeridianTouching, "_found"), (Waves, "counts")]
 FEW = 4  # looks of the undeformed shells, and of the last point
 
 
-@pytest.mark.parametrize(
-    ("symmetry", "mesh"),
-    [("auto", {"refinement": 0.3}), pytest.param("half", {"size": 0.15}, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("symmetry", "mesh"), [("auto", {"refinement": 0.3}), ("half", {"size": 0.15})])
 def test_a_resumed_run_looks_at_no_known_contact_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pictures: None, symmetry: str, mesh: dict[str, Any]
 ) -> None:
