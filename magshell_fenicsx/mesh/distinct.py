@@ -22,7 +22,7 @@ SHORT = 0.05  # a side over another one, from where its ends are told
 TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 
 
-def gathered(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
+def grouped_by_distance(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
     """Return groups of sorted coordinates (n,), each of which has one grid line.
 
     Parameters
@@ -38,25 +38,27 @@ def gathered(coordinates: Array, size: Callable[[float], float], rounding: float
             groups[-1] = np.append(groups[-1], c)
         else:
             groups.append(np.array([c]))
-    return [part for group in groups for part in _halved(group, max(rounding, WIDEST * size(float(group.mean()))))]
+    return [
+        part for group in groups for part in _narrow_parts(group, max(rounding, WIDEST * size(float(group.mean()))))
+    ]
 
 
 def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]) -> list[float]:
-    """Return one coordinate for each of the `gathered` groups that lie between two ends and beside none of them."""
+    """Return one coordinate for each group of near ones that lies between two ends, and beside none of them."""
 
-    def inside(x: float) -> bool:
+    def is_inside(x: float) -> bool:
         return min(x - ends[0], ends[1] - x) > max(SAME_PLACE, NEAR * size(x))
 
-    groups = gathered(np.array([x for x in coordinates if inside(float(x))]), size, SAME_PLACE)
+    groups = grouped_by_distance(np.array([x for x in coordinates if is_inside(float(x))]), size, SAME_PLACE)
     return [float(group[0] + group[-1]) / 2 for group in groups]
 
 
-def _halved(group: Array, widest: float) -> list[Array]:
-    """The group, or as many parts of it as have at most that width."""
+def _narrow_parts(group: Array, widest: float) -> list[Array]:
+    """Return a group of sorted coordinates (n,), or halves of halves of it that are no wider than `widest`."""
     if np.ptp(group) <= widest:
         return [group]
     lower = group < (group[0] + group[-1]) / 2
-    return [*_halved(group[lower], widest), *_halved(group[~lower], widest)]
+    return [*_narrow_parts(group[lower], widest), *_narrow_parts(group[~lower], widest)]
 
 
 def told_apart(one: Array, other: Array) -> tuple[str, str]:
@@ -96,28 +98,28 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
     length
         R in the coordinates of the message, which `words` name.
     """
-    flat = flatness(patch)
-    worst = int(flat.argmax())
-    if flat[worst] * default <= FLAT * penalty:
+    ratios = flatness(patch)
+    worst = int(ratios.argmax())
+    if ratios[worst] * default <= FLAT * penalty:
         return ""
     corners = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
     x, y, z = corners.mean(axis=0)
     sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
-    low = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
-    near = ""
+    height = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
+    near_vertices = ""
     if sides.min() < SHORT * sides.max():
         side = int(sides.argmin())
         one, other = told_apart(corners[side], corners[(side + 1) % 3])
-        near = f", with vertices at ({one}) and ({other})"
-    hint = _or_penalty(float(flat[worst]), default)
+        near_vertices = f", with vertices at ({one}) and ({other})"
+    hint = _or_penalty(float(ratios[worst]), default)
     return (
-        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {sides.max():.3g} long{near}"
-        f", too flat beside its neighbours: make triangles of like heights there{hint}"
+        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {height:.3g} high "
+        f"and {sides.max():.3g} long{near_vertices}, too flat beside its neighbours: make triangles of like heights there{hint}"
     )
 
 
 def _or_penalty(flat: float, default: float) -> str:
-    """The penalty that stands triangles so flat, as a hint; empty where none does."""
+    """Return a hint at the penalty that stands triangles of this `flatness`; empty where none does."""
     if not flat < TOO_FLAT:
         return ""
     return f", or take mesh.penalty: {np.ceil(default * flat / FLAT / 100) * 100:g}"

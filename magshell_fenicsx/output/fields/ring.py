@@ -14,7 +14,10 @@ from magshell_fenicsx.output.fields.tessellation import Numbers, Tessellation, t
 
 Array = NDArray[np.float64]
 FLAT = 0.02  # height over R below which a surface has no rings
-ASIDE = (1e-6, 0.01)  # over R: how far below the top, or above the bottom, a ring is cut; the latter at uneven rims
+ASIDE = (
+    1e-6,
+    0.01,
+)  # over R: how far below the top, or above the bottom, a ring is cut; the latter at uneven rims
 SAME_PLACE = 1e-9  # over R: distance of ends of pieces of the ring that are one
 GAP = np.pi / 4  # largest gap of a ring that is closed
 MOST_WAVES = 80
