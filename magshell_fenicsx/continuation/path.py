@@ -425,9 +425,9 @@ class Path:
         shortest = plan.length / 2 < self.options.smallest
         if not (shortest and self.control == "arc" and self.newton.options.corners and far.reason == TURNS):
             return False
-        return not far.point.turned_from(here) and not self.apart(here, self.seen_from(here, far.point))
+        return not far.point.turned_from(here) and not self.are_apart(here, self.seen_from(here, far.point))
 
-    def apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
+    def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
         """Whether two points are farther apart than a path between them is long, as their tangents show it.
 
         A distance below `least`, in lengths of the system, is that of rounding.

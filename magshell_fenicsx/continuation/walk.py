@@ -240,7 +240,7 @@ class _Search:
         An imperfect bifurcation has two paths close to each other, of different inertia: a bracket with an end on each
         shrinks to nothing in s and contains no instability.
         """
-        if self.path.apart(low, high, PARTED):
+        if self.path.are_apart(low, high, PARTED):
             raise PathStopped("the step jumped to another branch", low)
 
     def spent(self, point: Point) -> Point:

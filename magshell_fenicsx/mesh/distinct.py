@@ -114,7 +114,8 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
     hint = _or_penalty(float(ratios[worst]), default)
     return (
         f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {height:.3g} high "
-        f"and {sides.max():.3g} long{near_vertices}, too flat beside its neighbours: make triangles of like heights there{hint}"
+        f"and {sides.max():.3g} long{near_vertices}, too flat beside its "
+        f"neighbours: make triangles of like heights there{hint}"
     )
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-BEGUN, DONE = 0.1, 0.9  # of the way of a snap: between them it jumps
+JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # of the way of a snap: between them it jumps
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -51,7 +51,7 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
         way = (w - w[0]) / (w[-1] - w[0])
         # the last two rows are of one time
-        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (BEGUN, 0.5, DONE))
+        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (JUMP_BEGINS, 0.5, JUMP_ENDS))
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
         times = {"time": half, "departure": begun, "jump": done - begun}
         at_rest.append({**ends, **times, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})

@@ -129,11 +129,11 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     at = scene.model.system.at(state)
     numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}
     closer = {name: number for name, number in numbers.items() if number is not None}
-    certain = not closer or all(_certain(stage, point, closer) for point in (high, low))
+    certain = not closer or all(_is_certain(stage, point, closer) for point in (high, low))
     return {} if certain else closer
 
 
-def _certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
+def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
     """Return whether closer points change no critical mode's stiffness at a point by `CERTAIN` of it.
 
     True as well if a mode is not found: then nothing says that closer points would help.

@@ -213,7 +213,7 @@ class Touching(ContactTerm):
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        least = self._facing.least(self._now(), self._far, self._points)
+        least = self._facing.least_distance(self._now(), self._far, self._points)
         return least - self._h if least < self._far else np.nan
 
     def penetration(self) -> float:
@@ -288,7 +288,7 @@ class Touching(ContactTerm):
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        return self._facing.least(self._of_copies(u), self._far) - self._h
+        return self._facing.least_distance(self._of_copies(u), self._far) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
