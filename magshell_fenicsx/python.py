@@ -55,15 +55,17 @@ class Shell:
     radius
         The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
     unit
-        Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default the metre, which
-        is refused where bounds, radius and thickness say otherwise: give "m" where it is right.
+        Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default
+        the metre, which is refused where bounds, radius and thickness say otherwise: give "m" where
+        it is right.
     name, place, points, mesh, remanent
         Of one of several shells: the name before its edges and points, `upper.rim`; and where it is, its named points,
         its elements (`{"size": "2 mm"}`) and its remanence, as a case has them under `shells`.
     keys
-        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
-        `thickness_factor`, a formula of the place x, y, z over R or a function, is that of each place. A function is
-        interpolated with x in the coordinates of the mesh, in mm for instance; a formula never has these.
+        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The
+        thickness times `thickness_factor`, a formula of the place x, y, z over R or a function, is
+        that of each place. A function is interpolated with x in the coordinates of the mesh, in mm
+        for instance; a formula never has these.
 
     Raises
     ------
@@ -253,10 +255,11 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
     Parameters
     ----------
     remanent, applied
-        A vector of three numbers or formulas, of the remanence too a function on the mesh or its kind in a case, such
-        as "radial"; or all its keys in a case. In formulas x, y, z are the place over R, the `radius` of the shell, and
-        never the coordinates of the mesh: of the remanence the undeformed place, of the applied field the deformed one.
-        A function on the mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
+        A vector of three numbers or formulas, of the remanence too a function on the mesh or its
+        kind in a case, such as "radial"; or all its keys in a case. In formulas x, y, z are the
+        place over R, the `radius` of the shell, and never the coordinates of the mesh: of the
+        remanence the undeformed place, of the applied field the deformed one. A function on the
+        mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
         `interpolate(lambda x: np.sin(np.pi * x[0] / 80))` on a mesh in mm.
     keys
         What else a case has under `magnetic`.

@@ -278,7 +278,8 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
 
 
 def _warnings(case: Case, places: Array) -> tuple[str, ...]:
-    """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way, in words."""
+    """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way,
+    in words."""
     context = case.context
     abilities = (part.warning(context, places) for part in context.abilities)
     steps = (step.load.warning(step) for step in case.programme)

@@ -1,4 +1,5 @@
-"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and distinct."""
+"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and
+distinct."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -71,7 +72,8 @@ def _on_planes(x: Array, plane: Mirror | None) -> Array:
 
 
 def on_features(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
-    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it nearly is on.
+    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it nearly is
+    on.
 
     Parameters
     ----------
@@ -97,7 +99,8 @@ def on_features(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Ar
 
 
 def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
-    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on them."""
+    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on
+    them."""
     shape = drawn.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
         away = float(np.hypot(*chart))
@@ -184,7 +187,8 @@ class Vertices:
                 )
 
     def _refuse_beside_edges(self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
-        """See that a point is not beside an edge or a plane of symmetry, but on it or away from it."""
+        """See that a point is not beside an edge or a plane of symmetry, but on it or away from
+        it."""
         chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
         size = self.size(chart)
         if isinstance(shape, Grid):

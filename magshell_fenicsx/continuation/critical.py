@@ -42,8 +42,8 @@ def critical(
     Raises
     ------
     BoundaryLost, NoSystem
-        See `Boundary.followed`; there is no system where another mode is taken up; or other modes are unstable first,
-        and none of them is found.
+        See `Boundary.followed`; there is no system where another mode is taken up; or other modes
+        are unstable first, and none of them is found.
     """
     search = _Search(curve, null_vector, ends)
     begun_by: int | None = None  # the family of the boundary before, where this one begins at their crossing
@@ -78,10 +78,11 @@ def critical(
 
 
 def first_mode(curve: Curve, null_vector: NullVector, mode: Boundary, start: Locus) -> tuple[Boundary, Locus]:
-    """Return the boundary that a start belongs to, and its point: another mode's where that comes just before.
+    """Return the boundary that a start belongs to, and its point: another mode's where that comes
+    just before.
 
-    A path that has two modes at nearly one load may have named the second. Where others come long before, the start is
-    an instability beyond the first, and stays.
+    A path that has two modes at nearly one load may have named the second. Where others come long
+    before, the start is an instability beyond the first, and stays.
     """
     if not _unstable_families(mode, start):
         return mode, start
@@ -125,7 +126,8 @@ class _Search:
     ends: tuple[float, float]
 
     def mode_beyond(self, mode: Boundary, crossing: Locus, sense: float) -> _Successor:
-        """Return what goes on from a crossing: the mode that becomes critical, or a third one that does so there too.
+        """Return what goes on from a crossing: the mode that becomes critical, or a third one that
+        does so there too.
 
         Raises
         ------
@@ -147,7 +149,8 @@ class _Search:
         return self._first_of([crossing.met], starts_of, mode, crossing)
 
     def overtaking_mode(self, mode: Boundary, locus: Locus) -> _Successor:
-        """Return the mode that is the first where that of a boundary is not any more, at the same p.
+        """Return the mode that is the first where that of a boundary is not any more, at the same
+        p.
 
         Raises
         ------
@@ -162,7 +165,8 @@ class _Search:
         return self._first_of(_unstable_families(mode, locus), starts_of, mode, locus)
 
     def _boundary_of(self, family: int, locus: Locus, before: int) -> tuple[Boundary, Vector]:
-        """Return the boundary of a family that is taken up after another one, and its null vector at a point."""
+        """Return the boundary of a family that is taken up after another one, and its null vector
+        at a point."""
         return self.curve(family, locus), self.null_vector(locus, family, before)
 
     def _first_of(
@@ -172,7 +176,8 @@ class _Search:
         mode: Boundary,
         locus: Locus,
     ) -> _Successor:
-        """Return the first mode of some families, and of those that prove to be unstable before these.
+        """Return the first mode of some families, and of those that prove to be unstable before
+        these.
 
         Parameters
         ----------
@@ -213,7 +218,8 @@ def _unstable_families(mode: Boundary, locus: Locus) -> list[int]:
 
 
 def _beyond(mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]) -> Locus:
-    """Return a point of a boundary near its crossing, where its equations are singular: if possible the first instability."""
+    """Return a point of a boundary near its crossing, where its equations are singular: if possible
+    the first instability."""
     room = (ends[1] if sense > 0 else ends[0]) - crossing.p
     off = copysign(min(ASIDE * mode.scales[1], abs(room) / 2), sense)
     farthest: Locus | None = None

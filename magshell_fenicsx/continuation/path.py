@@ -61,7 +61,8 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        What happens to forces on the straight way from a point to a first guess; None if nothing does.
+        What happens to forces on the straight way from a point to a first guess; None if nothing
+        does.
     """
 
     def __init__(
@@ -199,7 +200,8 @@ class Path:
         return result
 
     def noted(self, find: Callable[[], Finding]) -> Finding:
-        """What is found at points of the path, or was in an interrupted run at this place in the journal."""
+        """What is found at points of the path, or was in an interrupted run at this place in the
+        journal."""
         return self._journal.noted(find)
 
     def _ahead(self, here: State, guess: State) -> Ahead:
@@ -418,9 +420,11 @@ class Path:
         return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
 
     def _passes_corners(self, here: Point, far: Far, plan: Plan) -> bool:
-        """Whether a turn by arc length, in the shortest step, is that of corners where points of a body touch.
+        """Whether a turn by arc length, in the shortest step, is that of corners where points of a
+        body touch.
 
-        Half as long a step would end before a corner that is just ahead, or behind two that are close.
+        Half as long a step would end before a corner that is just ahead, or behind two that are
+        close.
         """
         shortest = plan.length / 2 < self.options.smallest
         if not (shortest and self.control == "arc" and self.newton.options.corners and far.reason == TURNS):
@@ -428,7 +432,8 @@ class Path:
         return not far.point.turned_from(here) and not self.are_apart(here, self.seen_from(here, far.point))
 
     def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
-        """Whether two points are farther apart than a path between them is long, as their tangents show it.
+        """Whether two points are farther apart than a path between them is long, as their tangents
+        show it.
 
         A distance below `least`, in lengths of the system, is that of rounding.
         """

@@ -79,7 +79,8 @@ class NewtonOptions:
         Amplitudes that are the stiffness of faces between which forces set in within a step, as where shells touch,
         with their values in a state that has none.
     corners
-        Whether a path has corners although full steps do not circle, as where points of rigid bodies touch.
+        Whether a path has corners although full steps do not circle, as where points of rigid
+        bodies touch.
     """
 
     tolerance: float = 1e-9
@@ -342,10 +343,11 @@ class Linearised:
         return matrix, matrix.solve(*f, rough=True)
 
     def _too_old(self, matrix: Bordered, step: Direction) -> bool:
-        """Return whether steps do not shrink because a part of the matrix is of an earlier state, as is foreseen.
+        """Return whether steps do not shrink because a part of the matrix is of an earlier state,
+        as is foreseen.
 
-        It is small beside the rest at that state, but need not be so now. After the step the residual is what the
-        matrix lacks, times the step.
+        It is small beside the rest at that state, but need not be so now. After the step the
+        residual is what the matrix lacks, times the step.
         """
         before, size, hard = [s.size for s in self._iterates.steps if s.own], matrix.size(step), self._options.hard
         if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):

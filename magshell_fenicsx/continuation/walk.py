@@ -46,7 +46,8 @@ class Instability:
 
 
 class Clustered(PathStopped):
-    """Several instabilities, between `point` and `high`, are not parted by the points that can be found there."""
+    """Several instabilities, between `point` and `high`, are not parted by the points that can be
+    found there."""
 
     def __init__(self, point: Point, high: Point) -> None:
         super().__init__("several instabilities lie too close to each other", point)
@@ -237,8 +238,8 @@ class _Search:
     def refuse_apart(self, low: Point, high: Point) -> None:
         """Refuse two points that are not on one path.
 
-        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket with an end on each
-        shrinks to nothing in s and contains no instability.
+        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket
+        with an end on each shrinks to nothing in s and contains no instability.
         """
         if self.path.are_apart(low, high, PARTED):
             raise PathStopped("the step jumped to another branch", low)
@@ -406,8 +407,9 @@ class Walk:
     done
         Whether the last point ends the walk.
     clusters
-        The first points before, and behind, instabilities that were not parted. Such a cluster counts as one
-        instability, at the first of both points; its width is the error of the amplitude.
+        The first points before, and behind, instabilities that were not parted. Such a cluster
+        counts as one instability, at the first of both points; its width is the error of the
+        amplitude.
     """
 
     def __init__(
@@ -476,7 +478,8 @@ class Walk:
             self.path = self.path.in_steps(replace(options, first=shorter, several=several))
 
     def _steps(self) -> Iterator[tuple[Point, bool]]:
-        """Points ahead, as `Path.towards` has them; the end of an earlier step where none is found before a cluster."""
+        """Points ahead, as `Path.towards` has them; the end of an earlier step where none is found
+        before a cluster."""
         try:
             yield from self.path.towards(self.points[-1], self._ahead(), self._arrive)
         except PathStopped:
@@ -559,7 +562,8 @@ class Walk:
             raise
 
     def _cluster(self, low: Point, high: Point) -> Instability:
-        """Instabilities between two points as one: a fold if the amplitude turns back between them."""
+        """Instabilities between two points as one: a fold if the amplitude turns back between
+        them."""
         name = self.path.name
         point = replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
         self.clusters.append((point, high))

@@ -1,8 +1,10 @@
-"""Which places are distinct enough to be vertices of one mesh, and triangles that are too flat for their neighbours.
+"""Which places are distinct enough to be vertices of one mesh, and triangles that are too flat for
+their neighbours.
 
-The interior penalty of an edge is over the mean height of its two triangles. Where one is lower than about a hundredth
-of the other, the default penalty is too small, whatever the degree. So vertices that are nearer to each other than a
-part of the elements there share a grid line, or are refused.
+The interior penalty of an edge is over the mean height of its two triangles. Where one is lower
+than about a hundredth of the other, the default penalty is too small, whatever the degree. So
+vertices that are nearer to each other than a part of the elements there share a grid line, or are
+refused.
 """
 
 from collections.abc import Callable
@@ -44,7 +46,8 @@ def grouped_by_distance(coordinates: Array, size: Callable[[float], float], roun
 
 
 def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]) -> list[float]:
-    """Return one coordinate for each group of near ones that lies between two ends, and beside none of them."""
+    """Return one coordinate for each group of near ones that lies between two ends, and beside none
+    of them."""
 
     def is_inside(x: float) -> bool:
         return min(x - ends[0], ends[1] - x) > max(SAME_PLACE, NEAR * size(x))
@@ -54,7 +57,8 @@ def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[flo
 
 
 def _narrow_parts(group: Array, widest: float) -> list[Array]:
-    """Return a group of sorted coordinates (n,), or halves of halves of it that are no wider than `widest`."""
+    """Return a group of sorted coordinates (n,), or halves of halves of it that are no wider than
+    `widest`."""
     if np.ptp(group) <= widest:
         return [group]
     lower = group < (group[0] + group[-1]) / 2
@@ -72,9 +76,11 @@ def told_apart(one: Array, other: Array) -> tuple[str, str]:
 
 
 def flatness(patch: PatchMesh) -> Array:
-    """Return for each triangle (m,) how many times as high its neighbours are: sum (h + h') / (4 h) over its sides.
+    """Return for each triangle (m,) how many times as high its neighbours are: sum (h + h') / (4 h)
+    over its sides.
 
-    h and h' are the heights of the triangle and of its neighbour over a side. Alike triangles have 1.5.
+    h and h' are the heights of the triangle and of its neighbour over a side. Alike triangles have
+    1.5.
     """
     corners = patch.embedding(patch.nodes)[patch.cells[:, :3]]
     sides = corners[:, [1, 2, 0]] - corners
@@ -89,7 +95,8 @@ def flatness(patch: PatchMesh) -> Array:
 
 
 def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: float, words: str) -> str:
-    """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none is.
+    """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none
+    is.
 
     Parameters
     ----------
@@ -120,7 +127,8 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
 
 
 def _or_penalty(flat: float, default: float) -> str:
-    """Return a hint at the penalty that stands triangles of this `flatness`; empty where none does."""
+    """Return a hint at the penalty that stands triangles of this `flatness`; empty where none
+    does."""
     if not flat < TOO_FLAT:
         return ""
     return f", or take mesh.penalty: {np.ceil(default * flat / FLAT / 100) * 100:g}"

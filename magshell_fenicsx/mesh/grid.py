@@ -110,14 +110,16 @@ class Grid:
         return np.asarray(lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])])
 
     def straight_line_at(self, axis: int, x: float) -> float | None:
-        """The straight line that a coordinate is too near to for a line of its own, or on; None if there is none."""
+        """The straight line that a coordinate is too near to for a line of its own, or on; None if
+        there is none."""
         straight = self._straight(axis)
         nearest = float(straight[np.abs(straight - x).argmin()])
         rounding = CLOSE * (self.high[axis] - self.low[axis])
         return nearest if abs(nearest - x) <= max(rounding, NEAR * self.size_at(axis, x)) else None
 
     def _groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
-        """Groups of coordinates that are near each other, beside no straight line, and the line of each."""
+        """Groups of coordinates that are near each other, beside no straight line, and the line of
+        each."""
         rounding = CLOSE * (self.high[axis] - self.low[axis])
         given = np.unique([*(float(x[axis]) for x in points), *self.movable[axis]])
         free = np.array([x for x in given if self.straight_line_at(axis, float(x)) is None])
@@ -125,7 +127,8 @@ class Grid:
         return [(g, float(g[0] if np.ptp(g) <= rounding else (g[0] + g[-1]) / 2)) for g in groups]
 
     def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
-        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the first."""
+        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the
+        first."""
         numbers = np.zeros((len(points), 2), dtype=np.int64)
         for axis in range(2):
             lines, groups = self.lines(axis, points), self._groups(axis, points)

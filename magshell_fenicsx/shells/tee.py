@@ -237,7 +237,8 @@ class Foot:
     Y, apart
         (n, 2) the places in their cells, and (n,) their distances, inf without a cell.
     clearance
-        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of these cells.
+        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of
+        these cells.
     """
 
     cell: Longs
@@ -410,7 +411,8 @@ def _ends_of_cells(V: fem.FunctionSpace) -> Array:
 
 
 def _rings(V: fem.FunctionSpace, tied: tuple[float, float]) -> tuple[list[Longs], list[tuple[Array, Array]]]:
-    """Return the cells at both parameters of a junction, with their shape functions there and slopes, all in one row."""
+    """Return the cells at both parameters of a junction, with their shape functions there and
+    slopes, all in one row."""
     ends, shapes = _ends_of_cells(V), []
     inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
     cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
@@ -501,7 +503,8 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
 
 
 def _tee_joints(joints: Sequence[Joint], surface: Midsurface) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
-    """Return the joints that are T-junctions, with their keys and which cells of this rank the other shell has."""
+    """Return the joints that are T-junctions, with their keys and which cells of this rank the
+    other shell has."""
     pairs = enumerate(zip(joints, surface.joints, strict=True))
     tied = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
     return [*tied, *((Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items())]

@@ -61,7 +61,8 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
-    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no numbers.
+    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no
+    numbers.
 
     Raises
     ------

@@ -73,7 +73,8 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
 
 
 def stiffer(stage: Stage, high: Point) -> dict[str, float]:
-    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given stiffness none."""
+    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given
+    stiffness none."""
     return stiffnesses(stage.scene, stage.leave(high.state))
 
 
@@ -105,12 +106,14 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
 
 
 def recut(stage: Stage, high: Point) -> dict[str, float]:
-    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much better there."""
+    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much
+    better there."""
     return better_cuts(stage.scene, stage.leave(high.state))
 
 
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
-    """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run; collective."""
+    """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run;
+    collective."""
     at = stage.scene.model.system.at(stage.leave(high.state)) if numbers else None
     for each in _with_cuts(stage.scene):
         if at and each.pair.cuts in numbers:
@@ -118,10 +121,12 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
-    """Return the numbers of cuts with closer points of contact, where an instability lies between two points.
+    """Return the numbers of cuts with closer points of contact, where an instability lies between
+    two points.
 
-    Empty if there is none, or if closer points change neither the number of unstable directions of both nor much of
-    their critical modes' stiffness: of an instability that they move, nobody knows whether it is one.
+    Empty if there is none, or if closer points change neither the number of unstable directions of
+    both nor much of their critical modes' stiffness: of an instability that they move, nobody knows
+    whether it is one.
     """
     if not high.turned_from(low):
         return {}
@@ -134,7 +139,8 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
 
 
 def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
-    """Return whether closer points change no critical mode's stiffness at a point by `CERTAIN` of it.
+    """Return whether closer points change no critical mode's stiffness at a point by `CERTAIN` of
+    it.
 
     True as well if a mode is not found: then nothing says that closer points would help.
     """
@@ -302,7 +308,8 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
 
 
 def penetration_refused(scene: Scene, state: State, *, moving: bool = False) -> str:
-    """How a body penetrates more than its bound, or a shell, and the stiffness that would halve it; "" if none does.
+    """How a body penetrates more than its bound, or a shell, and the stiffness that would halve it;
+    "" if none does.
 
     Where shells hit each other in a motion, their bound is `IMPACT` times as large. Collective.
     """

@@ -71,8 +71,8 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
-    """A walk on which bodies become stiffer, and shells are cut anew and get closer points where these move an
-    instability; magnets on the way and returning bodies end it."""
+    """A walk on which bodies become stiffer, and shells are cut anew and get closer points where
+    these move an instability; magnets on the way and returning bodies end it."""
     checks = _Checks(stage, path, goal.until != "points")
     checks.walk = walk = Walk(path, start, goal, checks)
     return walk
@@ -118,7 +118,8 @@ class _Checks:
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
     def _found(self, low: Point, high: Point) -> Finding:
-        """Find out why the second of two points is refused, or which amplitudes change before it is solved again."""
+        """Find out why the second of two points is refused, or which amplitudes change before it is
+        solved again."""
         stage = self._stage
         try:
             refuse_crossing(stage, low, high)
@@ -331,7 +332,8 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
 
 
 def words_of_cluster(scene: Scene, walk: Walk, point: Point) -> str:
-    """Return what is said of instabilities that were not parted, at the point that stands for them; "" at others."""
+    """Return what is said of instabilities that were not parted, at the point that stands for them;
+    "" at others."""
     behind = next((high for low, high in walk.clusters if low is point), None)
     if behind is None:
         return ""

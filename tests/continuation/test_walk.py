@@ -229,7 +229,8 @@ def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> No
 
 
 def test_a_cluster_that_must_not_be_passed_ends_the_walk() -> None:
-    """No step over it is allowed once it is known as one: the end of an earlier step is tried once, not for ever."""
+    """No step over it is allowed once it is known as one: the end of an earlier step is tried once,
+    not for ever."""
     walk = along_column(column_of_modes(1e-9, 1e-4), "load", Goal("target", [1.5]))
     tried = list[float]()
 
@@ -254,7 +255,8 @@ def test_modes_too_close_to_part_count_as_one(control: str) -> None:
 
 
 def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
-    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends at a fold."""
+    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends
+    at a fold."""
     imperfection = 1e-5
     newton = BorderedNewton(pitchfork(imperfection))
     path, ends = Path(newton, "load", "load", StepOptions(0.4, 0.4, 1e-6)), []

@@ -1,4 +1,5 @@
-"""What is said of instabilities that a walk has passed without parting them, on modes whose loads are known."""
+"""What is said of instabilities that a walk has passed without parting them, on modes whose loads
+are known."""
 
 from types import SimpleNamespace
 from typing import cast

@@ -217,7 +217,8 @@ def test_a_step_that_cannot_be_done(steps: Sequence[dict[str, Any]], said: str) 
 
 
 def test_first_instability_on_the_way_to_a_target() -> None:
-    """A field of -3 times is three times the opposite one: the same fold; before it there is none."""
+    """A field of -3 times is three times the opposite one: the same fold; before it there is
+    none."""
     load = {"kind": "field", "until": "limit", "points": 2}
     dome = {"geometry": "cap", "polar": 40, "radius": 20, "thickness": 1, "poisson_ratio": 0.49}
     critical = []

@@ -88,8 +88,8 @@ def waves_around(surface: Surface) -> Waves | None:
 
     Returns
     -------
-    None if no single number of at least two waves dominates, if the surface is flat, or if the ring is not closed
-    around e3.
+    None if no single number of at least two waves dominates, if the surface is flat, or if the ring
+    is not closed around e3.
     """
     height = surface.r0[:, 2]
     if np.ptp(height) < FLAT:

@@ -1,4 +1,5 @@
-"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the next is computed.
+"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the
+next is computed.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through adios4dolfinx 0.9.3)
 raises on one rank in `Close` then, and the other ranks wait for ever.
@@ -116,7 +117,8 @@ class Ordering:
 
     @property
     def is_present(self) -> bool:
-        """Whether the order in use is the present one: each rank has the nodes that it had in the file's run."""
+        """Whether the order in use is the present one: each rank has the nodes that it had in the
+        file's run."""
         return np.array_equal(np.concatenate(self._parts), np.arange(len(self.places)))
 
     def gather(self, u: Vector) -> Array:
@@ -296,7 +298,8 @@ class Checkpoint:
         return found
 
     def _read(self, content: bytes) -> Finding:
-        """Return a finding, with this rank's part of its vector if the ranks have the nodes that they had."""
+        """Return a finding, with this rank's part of its vector if the ranks have the nodes that
+        they had."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         parts, rank = decoded["parts"], self._comm.rank

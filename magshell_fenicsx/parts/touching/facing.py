@@ -174,13 +174,15 @@ class Facing:
     def found(
         self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True, least: bool = False
     ) -> Places:
-        """The places that points, those of the rule if none are given, face at a displacement, within a distance of
-        faces or mid-surfaces; with `least` those of each point's least distance, and some others."""
+        """The places that points, those of the rule if none are given, face at a displacement,
+        within a distance of faces or mid-surfaces; with `least` those of each point's least
+        distance, and some others."""
         points = points or self._rule
         return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach, least=least))
 
     def least_distance(self, u: Array, far: float, points: Points | None = None) -> float:
-        """The least distance of any point at a displacement; `far` if none is nearer. Collective."""
+        """The least distance of any point at a displacement; `far` if none is nearer.
+        Collective."""
         for reach in (*(part * far for part in NEARER_FIRST), far):
             mine = float(self.found(u, reach, points, least=True).distance.min(initial=far))
             nearest = float(self._comm.allreduce(mine, MPI.MIN))
@@ -190,10 +192,11 @@ class Facing:
 
     @cached_property
     def _separate_surfaces(self) -> tuple[Longs, Inside]:
-        """The connected surface (n,) of each cell, and whether places of one face all of another one, (m, m).
+        """The connected surface (n,) of each cell, and whether places of one face all of another
+        one, (m, m).
 
-        Of another surface each point's nearest place counts: it goes on from there to none that is nearer, and no place
-        of it is near the point in the point's own surface.
+        Of another surface each point's nearest place counts: it goes on from there to none that is
+        nearer, and no place of it is near the point in the point's own surface.
         """
         cell, side = np.nonzero(self._cells.across >= 0)
         n, beyond = len(self._cells.nodes), self._cells.across[cell, side]
@@ -209,7 +212,8 @@ class Facing:
         return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
 
     def _limits(self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float) -> Limits:
-        """How far the nearest place of a surface that is apart is at most: its nearest node within `most` is one.
+        """How far the nearest place of a surface that is apart is at most: its nearest node within
+        `most` is one.
 
         Parameters
         ----------
@@ -230,7 +234,8 @@ class Facing:
         return Limits(apart[number[pairs[0]], number[pairs[1]]], reach)
 
     def places_in(self, points: Points, u: Array, r: Array, reach: float, *, least: bool = False) -> Places:
-        """The places of all cells nearest to points, within a distance at a displacement; r as of `placed`."""
+        """The places of all cells nearest to points, within a distance at a displacement; r as of
+        `placed`."""
         thicker = highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
         of_faces, reach = reach, reach + 2 * thicker
         i, j = self._near_cells(u, reach)

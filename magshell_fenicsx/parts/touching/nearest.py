@@ -388,7 +388,8 @@ def determinant(A: Array) -> Array:
 
 
 def near_pairs(centres: Array, radii: Array, reach: float, own: Longs) -> tuple[Longs, Longs]:
-    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes of similar radii."""
+    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes
+    of similar radii."""
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
     owned = [own[size[own] == k] for k in np.unique(size)]
