@@ -30,8 +30,8 @@ from magshell_fenicsx.shape.sections import ShellSection, Surface
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
-FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is in another unit than metres
-THICKEST, THINNEST = 3.0, 1e4  # extents of a mesh over the thickness that metres may have if nothing says so
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is not in metres
+THICKEST, THINNEST = 3.0, 1e4  # a mesh's extent over the thickness, where metres are not asked for
 MESH = "the mesh"  # the same, of a mesh
 SHAPES: Mapping[str, type[BaseModel]] = {  # geometry -> its section
     geometry: section

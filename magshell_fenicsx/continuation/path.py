@@ -36,7 +36,7 @@ VAIN = 5  # failures one after the other, after which no line search is tried: a
 NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
 ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
-FARTHER = 3.0  # two states that are so many times as far apart as their tangents lead are not on one path
+FARTHER = 3.0  # states so many times as far apart as their tangents lead are not on one path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 

@@ -23,7 +23,7 @@ from magshell_fenicsx.platform import compat
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-AWAY = 1.0  # in lengths: after a longer step that part would soon be older again if it were made anew
+AWAY = 1.0  # in lengths: after a longer step that part would soon be too old again
 FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk

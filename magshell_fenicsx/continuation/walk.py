@@ -441,7 +441,7 @@ class Walk:
                 if state:
                     try:
                         self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
-                        self._allowance.end = None  # a point of the amplitudes before is not on this path
+                        self._allowance.end = None  # it has the amplitudes before
                         break
                     except PathStopped as e:
                         if self._renew and self._renew(low, point):  # nearer to the first point the change is smaller
@@ -487,7 +487,7 @@ class Walk:
             if not (allowance.end and allowance.clustered):
                 raise
             end = self.path.as_base(self.path.measured_from(here, allowance.end))
-            allowance.repeated, allowance.end = MOST_REPEATED, None  # where it is refused, the path has stopped
+            allowance.repeated, allowance.end = MOST_REPEATED, None  # it is tried once
             yield end, end.s in self._ahead()
             yield from self._steps()
 

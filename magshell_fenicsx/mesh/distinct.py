@@ -16,10 +16,10 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, directed_sides
 
 Array = NDArray[np.float64]
 SAME_PLACE = 1e-6  # over R: nearer places are one, and a place so near to an edge is on it
-NEAR = 0.02  # of the element size: with nearer vertices cells are too flat; with half of that a plate is unstable
+NEAR = 0.02  # of the element size: nearer vertices make cells too flat; at half of it plates are unstable
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
-FLAT = 25.0  # `flatness` from where meshes of the default penalty may be unstable: 26 to 37 in grids, 32 to 47 by gmsh
+FLAT = 25.0  # `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
 SHORT = 0.05  # a side over another one, from where its ends are told
 TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 

@@ -96,7 +96,7 @@ class _Checks:
 
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
-        self._cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
+        self._cut_at = np.nan  # s of the point behind which cuts were last made anew: once for each
 
     def __call__(self, low: Point, high: Point) -> State | None:
         """See `Walk`.

@@ -41,7 +41,7 @@ TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that ha
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
 DIGITS = 6  # bytes of the hash of a displacement in the number of its cuts
-LEVELS = 16  # numbers of divisions that the number of cuts can tell apart: with the hash, a float has all digits
+LEVELS = 16  # more divisions the number of cuts cannot tell: a float has these and the hash exactly
 CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])  # in the reference triangle
 
 
@@ -306,10 +306,10 @@ class Segments:
         one, other = one[order], other[order]
         pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
         points, triangles = [rule.of(~np.isin(rule.cell, one))], self._triangles(pieces)
-        for number in range(divisions):
-            closing = self._closing(triangles, gaps)
-            points += self._on(triangles.of(~closing), number)
-            triangles = triangles.of(closing).divided()
+        for times in range(divisions):
+            is_closing = self._closing(triangles, gaps)
+            points += self._on(triangles.of(~is_closing), times)
+            triangles = triangles.of(is_closing).divided()
         return Points.joined([*points, *self._on(triangles, divisions)])
 
     def _closing(self, triangles: Triangles, gaps: Callable[[Points], Array]) -> Inside:
