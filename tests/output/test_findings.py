@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.continuation.point import Finding
 from magshell_fenicsx.output.store.checkpoint import Checkpoint, framed
+from magshell_fenicsx.output.store.durable import Damaged
 
 VECTOR = np.linspace(0, 1, 7) / 3
 
@@ -41,4 +42,21 @@ def test_a_finding_is_read_back(tmp_path: Path, renumbered: bool) -> None:
     assert found.vector is None if renumbered else np.array_equal(found.vector, VECTOR)
     assert without == Finding({"raised": {}})
     assert second.noted(lambda: Finding({"next": 1})).values == {"next": 1}
+    second.close()
+
+
+def test_a_finding_is_no_result(tmp_path: Path) -> None:
+    """Nor is a result a finding: a history that goes another way than that of its file is refused."""
+    V = fem.functionspace(mesh.create_unit_square(MPI.COMM_SELF, 2, 2), ("Lagrange", 1, (3,)))
+    file = tmp_path / "checkpoint"
+    file.write_bytes(framed(b"{}") + framed(V.tabulate_dof_coordinates().tobytes()))
+    first = Checkpoint(file, V, MPI.COMM_SELF)
+    first.noted(made_once)
+    first.record("no convergence")
+    first.close()
+    second = Checkpoint(file, V, MPI.COMM_SELF)
+    with pytest.raises(Damaged, match="its results are in another order"):
+        second.replay()
+    with pytest.raises(Damaged, match="its results are in another order"):
+        second.noted(made_again)
     second.close()

@@ -302,10 +302,22 @@ class Checkpoint:
         they had."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
+        self._refuse_other_kind(is_other="values" not in decoded)
         parts, rank = decoded["parts"], self._comm.rank
         if len(parts) != self._comm.size or not self._ordering.is_present:
             return Finding(decoded["values"])
         return Finding(decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank])
+
+    def _refuse_other_kind(self, *, is_other: bool) -> None:
+        """See that the file has a result where a result is wanted, and a finding where one is.
+
+        Raises
+        ------
+        Damaged
+            If it is the other: the history has gone another way than that of the file.
+        """
+        if is_other:
+            raise Damaged(f"{self._file}: is damaged: its results are in another order than this run's")
 
     def record(self, result: Point | str) -> None:
         """Put a result on disk."""
@@ -343,6 +355,7 @@ class Checkpoint:
     def _decoded(self, content: bytes) -> Point | str:
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
+        self._refuse_other_kind(is_other="values" in decoded)
         if "failure" in decoded:
             return str(decoded["failure"])
         u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
