@@ -48,7 +48,7 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    goal, name, h = step.load.target, step.name, scene.problem.material.h
+    goal, name, h = step.load.target or step.load.bound, step.name, scene.problem.material.h
     end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
     region = scene.model.region(state, name)
     if region.penetration > NEAR * h or end <= state.mu[name]:
