@@ -30,8 +30,8 @@ from magshell_fenicsx.shape.sections import ShellSection, Surface
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
-FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is in another unit than metres
-THICKEST, THINNEST = 3.0, 1e4  # extents of a mesh over the thickness that metres may have if nothing says so
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is not in metres
+THICKEST, THINNEST = 3.0, 1e4  # a mesh's extent over the thickness, where metres are not asked for
 MESH = "the mesh"  # the same, of a mesh
 SHAPES: Mapping[str, type[BaseModel]] = {  # geometry -> its section
     geometry: section
@@ -55,15 +55,17 @@ class Shell:
     radius
         The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
     unit
-        Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default the metre, which
-        is refused where bounds, radius and thickness say otherwise: give "m" where it is right.
+        Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default
+        the metre, which is refused where bounds, radius and thickness say otherwise: give "m" where
+        it is right.
     name, place, points, mesh, remanent
         Of one of several shells: the name before its edges and points, `upper.rim`; and where it is, its named points,
         its elements (`{"size": "2 mm"}`) and its remanence, as a case has them under `shells`.
     keys
-        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
-        `thickness_factor`, a formula of the place x, y, z over R or a function, is that of each place. A function is
-        interpolated with x in the coordinates of the mesh, in mm for instance; a formula never has these.
+        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The
+        thickness times `thickness_factor`, a formula of the place x, y, z over R or a function, is
+        that of each place. A function is interpolated with x in the coordinates of the mesh, in mm
+        for instance; a formula never has these.
 
     Raises
     ------
@@ -253,10 +255,11 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
     Parameters
     ----------
     remanent, applied
-        A vector of three numbers or formulas, of the remanence too a function on the mesh or its kind in a case, such
-        as "radial"; or all its keys in a case. In formulas x, y, z are the place over R, the `radius` of the shell, and
-        never the coordinates of the mesh: of the remanence the undeformed place, of the applied field the deformed one.
-        A function on the mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
+        A vector of three numbers or formulas, of the remanence too a function on the mesh or its
+        kind in a case, such as "radial"; or all its keys in a case. In formulas x, y, z are the
+        place over R, the `radius` of the shell, and never the coordinates of the mesh: of the
+        remanence the undeformed place, of the applied field the deformed one. A function on the
+        mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
         `interpolate(lambda x: np.sin(np.pi * x[0] / 80))` on a mesh in mm.
     keys
         What else a case has under `magnetic`.
@@ -305,11 +308,12 @@ def _refuse_metres(extents: NDArray[np.float64], radius: float | str | None, thi
 
 
 def _in_metres(length: Any) -> float | None:
-    """A length that was given; None if it is none, which is refused elsewhere."""
+    """Return a length in metres; None if it is no positive one, which is refused elsewhere."""
     try:
-        return float(in_units("metre")(length)) or None
+        metres = float(in_units("metre")(length))
     except (TypeError, ValueError):
         return None
+    return metres if metres > 0 else None
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:

@@ -332,7 +332,8 @@ class FiniteElementSystem:
         return Skewed(K, N) if N else K
 
     def _present_of_all(self, factors: Mapping[str, float], *, rough: bool) -> Callable[[Vector], Vector]:
-        """The tangent of some terms, at the displacement that is set now, times a vector: by differences of forces.
+        """The tangent of some terms, at the displacement that is set now, times a vector: by
+        differences of forces.
 
         If `rough`, of forces that are foreseen.
         """

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.meeting import Meeting
 from magshell_fenicsx.case.opened import changed, perfect_case
-from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, settled
+from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, on_features
 from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.assembly import Assembly
@@ -110,7 +110,7 @@ def make_problem(
     points = named_points(case, drawn, turn, beyond)
     under = dict[str, str]()
     for name, (step, place) in places.items():
-        chart = settled(step.load.chart_of(place, drawn, turn, half=half), drawn, points)
+        chart = on_features(step.load.chart_of(place, drawn, turn, half=half), drawn, points)
         candidates = (point for point in ("pole", *under.values()) if point in points)
         same = (point for point in candidates if np.array_equal(points[point], chart))
         under[name] = next(same, name.replace("force", "load"))
@@ -141,8 +141,8 @@ def make_problem(
         shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
-        x, y = ((*shape.loose[i], *(float(image[i]) for image in images)) for i in range(2))
-        shape = replace(shape, loose=(x, y))
+        x, y = ((*shape.movable[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, movable=(x, y))
     rims = different(local)
     if isinstance(beyond, Sector) and any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
@@ -278,7 +278,8 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
 
 
 def _warnings(case: Case, places: Array) -> tuple[str, ...]:
-    """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way, in words."""
+    """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way,
+    in words."""
     context = case.context
     abilities = (part.warning(context, places) for part in context.abilities)
     steps = (step.load.warning(step) for step in case.programme)

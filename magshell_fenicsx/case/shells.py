@@ -93,12 +93,14 @@ Shells = Annotated[dict[str, OneOfShells], Field(min_length=1, max_length=50)]
 
 
 def in_words_of_shells(message: str, data: Any) -> str:
-    """Return a message with the names of the case file: `upper.rim` in place of `upper_rim`, which stands for it.
+    """Return a message with the names of the case file: `upper.rim` in place of `upper_rim`, which
+    stands for it.
 
     Parameters
     ----------
     data
-        Plain data of a case. Edges and points that it names, and edges of all geometries, are known.
+        Plain data of a case. Edges and points that it names, and edges of all geometries, are
+        known.
 
     Examples
     --------

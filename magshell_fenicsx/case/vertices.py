@@ -1,4 +1,5 @@
-"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and distinct."""
+"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and
+distinct."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None
         x = np.array(place) / R
         refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
         chart = chart_of(_on_planes(Q @ x, plane), drawn, half=plane is not None)
-        points[name] = settled(chart, drawn, points)
+        points[name] = on_features(chart, drawn, points)
     if points:
         points["pole"] = next(iter(points.values()))
     elif drawn.highest is not None:
@@ -70,29 +71,36 @@ def _on_planes(x: Array, plane: Mirror | None) -> Array:
     return x
 
 
-def settled(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
-    """Return that of the points which is at the same place as a chart (2 | 3,), or the chart, moved onto an edge or a
-    pole that it nearly is on."""
+def on_features(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
+    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it nearly is
+    on.
+
+    Parameters
+    ----------
+    points
+        Those known before, which come first.
+    """
     if len(chart) != CHART:
         return chart
     (place,) = drawn.embedding(chart[None])
 
-    def same(other: Array) -> bool:
+    def is_at(other: Array) -> bool:
         return bool(np.linalg.norm(drawn.embedding(other[None])[0] - place) <= SAME_PLACE)
 
     for point in points.values():
-        if same(point):
+        if is_at(point):
             return point
-    if drawn.disc and same(np.zeros(CHART)):
+    if drawn.disc and is_at(np.zeros(CHART)):
         return np.zeros(CHART)
     for edge in edges_near(chart, drawn):  # one after the other: of two that meet at a corner too
         on = edges_near(chart, drawn)[edge]
-        chart = on if same(on) else chart
+        chart = on if is_at(on) else chart
     return chart
 
 
 def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
-    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on them."""
+    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on
+    them."""
     shape = drawn.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
         away = float(np.hypot(*chart))
@@ -102,7 +110,12 @@ def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
         names, glued = ("root", "tip", "sides", "sides"), (False, False)
     else:
         assert isinstance(shape, Grid)
-        low, high, names, glued = np.array(shape.low), np.array(shape.high), shape.sides, shape.glued
+        low, high, names, glued = (
+            np.array(shape.low),
+            np.array(shape.high),
+            shape.sides,
+            shape.glued,
+        )
     is_high = chart - low >= high - chart
     nearest = np.where(is_high, high, low)
     return {
@@ -160,15 +173,22 @@ class Vertices:
         for name in self.points:
             self._refuse_beside_edges(name, shape, plane)
         places = list(self.points.values())
-        taken = shape.vertices_of(places) if isinstance(shape, Grid) else None
+        vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
         for (i, one), (j, other) in combinations(enumerate(self.points), 2):
             apart = float(np.hypot(*(places[i] - places[j])))
-            near = (taken[i] == taken[j]).all() if taken is not None else apart < NEAR * self.size(places[i])
+            near = (vertices[i] == vertices[j]).all() if vertices is not None else apart < NEAR * self.size(places[i])
             if near and not np.array_equal(places[i], places[j]):
-                self._refuse(one, self._place(places[j]), f"{self._key(other)}: [{{}}]", "give one of them", NEAR)
+                self._refuse(
+                    one,
+                    self._place(places[j]),
+                    f"{self._key(other)}: [{{}}]",
+                    "give one of them",
+                    NEAR,
+                )
 
     def _refuse_beside_edges(self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
-        """See that a point is not beside an edge or a plane of symmetry, but on it or away from it."""
+        """See that a point is not beside an edge or a plane of symmetry, but on it or away from
+        it."""
         chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
         size = self.size(chart)
         if isinstance(shape, Grid):
@@ -177,7 +197,10 @@ class Vertices:
         for side in plane.sides.values() if plane else ():
             off = float(side.beyond(place))
             if ROUNDING < abs(off) < factor * size:
-                on, hint = self._told(place - off * side.normal), "put it there, or take symmetry: none"
+                on, hint = (
+                    self._told(place - off * side.normal),
+                    "put it there, or take symmetry: none",
+                )
                 self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
         for edge, on in edges_near(chart, self.drawn).items():
             if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:

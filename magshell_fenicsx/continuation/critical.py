@@ -42,19 +42,19 @@ def critical(
     Raises
     ------
     BoundaryLost, NoSystem
-        See `Boundary.followed`; there is no system where another mode is taken up; or other modes are unstable first,
-        and none of them is found.
+        See `Boundary.followed`; there is no system where another mode is taken up; or other modes
+        are unstable first, and none of them is found.
     """
     search = _Search(curve, null_vector, ends)
     begun_by: int | None = None  # the family of the boundary before, where this one begins at their crossing
     while True:
-        last, onward = start, None
+        last, successor = start, None
         for label, locus in mode.followed(start, sense, ends, steps):
             if last is start and label == "crossing" and locus.met == begun_by:
                 continue
-            if not last.unstable and label in ("point", "end") and _families_before(mode, locus):
-                onward, sense = search.overtaking(mode, locus), locus.p - last.p
-                yield label, onward.start, onward.mode
+            if not last.unstable and label in ("point", "end") and _unstable_families(mode, locus):
+                successor, sense = search.overtaking_mode(mode, locus), locus.p - last.p
+                yield label, successor.start, successor.mode
                 if label == "end":
                     return
                 break
@@ -64,29 +64,30 @@ def critical(
                 continue
             sense = locus.p - last.p
             try:
-                onward = search.beyond(mode, locus, sense)
+                successor = search.mode_beyond(mode, locus, sense)
             except BoundaryLost:
                 yield label, locus, mode
                 raise
-            yield label, replace(locus, met=onward.mode.m), mode
-            if onward.begun_by is None:
-                yield "point", onward.start, onward.mode
+            yield label, replace(locus, met=successor.mode.m), mode
+            if successor.begun_by is None:
+                yield "point", successor.start, successor.mode
             break
-        if onward is None:
+        if successor is None:
             return
-        mode, start, begun_by = onward.mode, onward.start, onward.begun_by
+        mode, start, begun_by = successor.mode, successor.start, successor.begun_by
 
 
 def first_mode(curve: Curve, null_vector: NullVector, mode: Boundary, start: Locus) -> tuple[Boundary, Locus]:
-    """Return the boundary that a start belongs to, and its point: another mode's where that comes just before.
+    """Return the boundary that a start belongs to, and its point: another mode's where that comes
+    just before.
 
-    A path that has two modes at nearly one load may have named the second. Where others come long before, the start is
-    an instability beyond the first, and stays.
+    A path that has two modes at nearly one load may have named the second. Where others come long
+    before, the start is an instability beyond the first, and stays.
     """
-    if not _families_before(mode, start):
+    if not _unstable_families(mode, start):
         return mode, start
     try:
-        before = _Search(curve, null_vector, (start.p, start.p)).overtaking(mode, start)
+        before = _Search(curve, null_vector, (start.p, start.p)).overtaking_mode(mode, start)
     except BoundaryLost:
         return mode, start
     one, other = (locus.state.mu[mode.name] for locus in (start, before.start))
@@ -94,8 +95,16 @@ def first_mode(curve: Curve, null_vector: NullVector, mode: Boundary, start: Loc
 
 
 @dataclass(frozen=True)
-class _Onward:
-    """A boundary that goes on, its first point, and where that is a crossing the family of the boundary before."""
+class _Successor:
+    """The boundary that goes on after another one.
+
+    Attributes
+    ----------
+    mode, start
+        The boundary, and its first point.
+    begun_by
+        The family of the boundary before, where both cross at the first point; None elsewhere.
+    """
 
     mode: Boundary
     start: Locus
@@ -104,14 +113,21 @@ class _Onward:
 
 @dataclass(frozen=True)
 class _Search:
-    """Looks for the mode that is the first, among those that are unstable where another one is neutral."""
+    """The search for the first mode, among those that are unstable where another one is neutral.
+
+    Attributes
+    ----------
+    curve, null_vector, ends
+        As of `critical`.
+    """
 
     curve: Curve
     null_vector: NullVector
     ends: tuple[float, float]
 
-    def beyond(self, mode: Boundary, crossing: Locus, sense: float) -> _Onward:
-        """Return what goes on from a crossing: the mode that becomes critical, or a third one that does so there too.
+    def mode_beyond(self, mode: Boundary, crossing: Locus, sense: float) -> _Successor:
+        """Return what goes on from a crossing: the mode that becomes critical, or a third one that
+        does so there too.
 
         Raises
         ------
@@ -119,17 +135,22 @@ class _Search:
             If none of them is the first beyond it.
         """
 
-        def taken_up(family: int) -> Iterator[_Onward]:
-            other, phi = self._of(family, crossing, mode.m)
+        def starts_of(family: int) -> Iterator[_Successor]:
+            other, phi = self._boundary_of(family, crossing, mode.m)
             if mode.m and family not in (0, mode.m):  # neither equation knows of the other
                 start = other.start(crossing.p, crossing.state, phi)
-                yield _Onward(other, replace(start, unstable=start.unstable - start.unstable_of(mode.m)), mode.m)
-            yield _Onward(other, _beyond(other, crossing, phi, sense, self.ends))
+                yield _Successor(
+                    other,
+                    replace(start, unstable=start.unstable - start.unstable_of(mode.m)),
+                    mode.m,
+                )
+            yield _Successor(other, _beyond(other, crossing, phi, sense, self.ends))
 
-        return self._first([crossing.met], taken_up, mode, crossing)
+        return self._first_of([crossing.met], starts_of, mode, crossing)
 
-    def overtaking(self, mode: Boundary, locus: Locus) -> _Onward:
-        """Return the mode that is the first where that of a boundary is not any more, at the same p.
+    def overtaking_mode(self, mode: Boundary, locus: Locus) -> _Successor:
+        """Return the mode that is the first where that of a boundary is not any more, at the same
+        p.
 
         Raises
         ------
@@ -137,27 +158,49 @@ class _Search:
             If none is found.
         """
 
-        def taken_up(family: int) -> Iterator[_Onward]:
-            other, phi = self._of(family, locus, mode.m)
-            yield _Onward(other, other.start(locus.p, locus.state, phi))
+        def starts_of(family: int) -> Iterator[_Successor]:
+            other, phi = self._boundary_of(family, locus, mode.m)
+            yield _Successor(other, other.start(locus.p, locus.state, phi))
 
-        return self._first(_families_before(mode, locus), taken_up, mode, locus)
+        return self._first_of(_unstable_families(mode, locus), starts_of, mode, locus)
 
-    def _of(self, family: int, locus: Locus, before: int) -> tuple[Boundary, Vector]:
+    def _boundary_of(self, family: int, locus: Locus, before: int) -> tuple[Boundary, Vector]:
+        """Return the boundary of a family that is taken up after another one, and its null vector
+        at a point."""
         return self.curve(family, locus), self.null_vector(locus, family, before)
 
-    def _first(
-        self, families: Sequence[int], taken_up: Callable[[int], Iterator[_Onward]], mode: Boundary, locus: Locus
-    ) -> _Onward:
-        """The first mode of some families, and of those that prove to be unstable before these."""
-        asked, why = [*families], "none that comes before it is the first there"
-        for family in asked:  # which grows
+    def _first_of(
+        self,
+        families: Sequence[int],
+        starts_of: Callable[[int], Iterator[_Successor]],
+        mode: Boundary,
+        locus: Locus,
+    ) -> _Successor:
+        """Return the first mode of some families, and of those that prove to be unstable before
+        these.
+
+        Parameters
+        ----------
+        starts_of
+            Family -> where it may be taken up, one after the other.
+        mode, locus
+            The boundary that ends, and its last point, for the message.
+
+        Raises
+        ------
+        BoundaryLost
+            If none is found.
+        """
+        families_asked, why = [*families], "none that comes before it is the first there"
+        for family in families_asked:  # which grows
             try:
-                for onward in taken_up(family):
-                    if not onward.start.unstable:
-                        return onward
-                    found = _families_before(onward.mode, onward.start)
-                    asked += [other for other in found if other not in asked and other != mode.m]
+                for successor in starts_of(family):
+                    if not successor.start.unstable:
+                        return successor
+                    unstable_there = _unstable_families(successor.mode, successor.start)
+                    families_asked += [
+                        other for other in unstable_there if other not in families_asked and other != mode.m
+                    ]
             except (BoundaryLost, NoSystem) as e:
                 why = str(e)
         load = locus.state.mu[mode.name]
@@ -166,13 +209,17 @@ class _Search:
         )
 
 
-def _families_before(mode: Boundary, locus: Locus) -> list[int]:
-    """The families with modes that are unstable at a point; the model's own ones along its own are a `meeting`."""
+def _unstable_families(mode: Boundary, locus: Locus) -> list[int]:
+    """Return the families with modes that are unstable at a point of a boundary.
+
+    Not the model's own family along its own boundary: such a place is a `meeting`.
+    """
     return [i for i, count in enumerate(locus.counts) if count and not i == mode.m == 0]
 
 
 def _beyond(mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]) -> Locus:
-    """A point of a boundary near its crossing, where its equations are singular: if possible the first instability."""
+    """Return a point of a boundary near its crossing, where its equations are singular: if possible
+    the first instability."""
     room = (ends[1] if sense > 0 else ends[0]) - crossing.p
     off = copysign(min(ASIDE * mode.scales[1], abs(room) / 2), sense)
     farthest: Locus | None = None

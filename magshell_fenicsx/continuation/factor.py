@@ -152,7 +152,8 @@ class Factorisation:
         return True
 
     def change(self, x: Vector) -> Vector:
-        """Return the product of x with what the older part of the latest tangent lacks, as foreseen; collective."""
+        """Return the product of x with what the older part of the latest tangent lacks, as
+        foreseen; collective."""
         change, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
         if self._rest and self._beside:
             change[:rows] = self._beside.change(x[:rows])

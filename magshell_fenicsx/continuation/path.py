@@ -36,7 +36,7 @@ VAIN = 5  # failures one after the other, after which no line search is tried: a
 NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
 WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
 ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
-FARTHER = 3.0  # two states that are so many times as far apart as their tangents lead are not on one path
+FARTHER = 3.0  # states so many times as far apart as their tangents lead are not on one path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -61,7 +61,8 @@ class Path:
     progress
         Gets every step before it is tried.
     setting_in
-        What happens to forces on the straight way from a point to a first guess; None if nothing does.
+        What happens to forces on the straight way from a point to a first guess; None if nothing
+        does.
     """
 
     def __init__(
@@ -199,7 +200,8 @@ class Path:
         return result
 
     def noted(self, find: Callable[[], Finding]) -> Finding:
-        """What is found at points of the path, or was in an interrupted run at this place in the journal."""
+        """What is found at points of the path, or was in an interrupted run at this place in the
+        journal."""
         return self._journal.noted(find)
 
     def _ahead(self, here: State, guess: State) -> Ahead:
@@ -418,17 +420,20 @@ class Path:
         return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
 
     def _passes_corners(self, here: Point, far: Far, plan: Plan) -> bool:
-        """Whether a turn by arc length, in the shortest step, is that of corners where points of a body touch.
+        """Whether a turn by arc length, in the shortest step, is that of corners where points of a
+        body touch.
 
-        Half as long a step would end before a corner that is just ahead, or behind two that are close.
+        Half as long a step would end before a corner that is just ahead, or behind two that are
+        close.
         """
         shortest = plan.length / 2 < self.options.smallest
         if not (shortest and self.control == "arc" and self.newton.options.corners and far.reason == TURNS):
             return False
-        return not far.point.turned_from(here) and not self.apart(here, self.seen_from(here, far.point))
+        return not far.point.turned_from(here) and not self.are_apart(here, self.seen_from(here, far.point))
 
-    def apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
-        """Whether two points are farther apart than a path between them is long, as their tangents show it.
+    def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
+        """Whether two points are farther apart than a path between them is long, as their tangents
+        show it.
 
         A distance below `least`, in lengths of the system, is that of rounding.
         """

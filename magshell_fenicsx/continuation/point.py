@@ -99,8 +99,9 @@ class Finding:
 class Journal(Protocol):
     """The results of `Path.recorded` and the findings of a history, in their order.
 
-    A history is deterministic: from the same results it chooses the same steps, targets and brackets. So the
-    results are a complete checkpoint. What is found at these results follows from them, and is kept for its cost.
+    A history is deterministic: from the same results it chooses the same steps, targets and
+    brackets. So the results are a complete checkpoint. What is found at these results follows from
+    them, and is kept for its cost.
     """
 
     def replay(self) -> Point | str | None:

@@ -23,7 +23,7 @@ from magshell_fenicsx.platform import compat
 MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-AWAY = 1.0  # in lengths: after a longer step that part would soon be older again if it were made anew
+AWAY = 1.0  # in lengths: after a longer step that part would soon be too old again
 FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
 CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
@@ -79,7 +79,8 @@ class NewtonOptions:
         Amplitudes that are the stiffness of faces between which forces set in within a step, as where shells touch,
         with their values in a state that has none.
     corners
-        Whether a path has corners although full steps do not circle, as where points of rigid bodies touch.
+        Whether a path has corners although full steps do not circle, as where points of rigid
+        bodies touch.
     """
 
     tolerance: float = 1e-9
@@ -342,10 +343,11 @@ class Linearised:
         return matrix, matrix.solve(*f, rough=True)
 
     def _too_old(self, matrix: Bordered, step: Direction) -> bool:
-        """Return whether steps do not shrink because a part of the matrix is of an earlier state, as is foreseen.
+        """Return whether steps do not shrink because a part of the matrix is of an earlier state,
+        as is foreseen.
 
-        It is small beside the rest at that state, but need not be so now. After the step the residual is what the
-        matrix lacks, times the step.
+        It is small beside the rest at that state, but need not be so now. After the step the
+        residual is what the matrix lacks, times the step.
         """
         before, size, hard = [s.size for s in self._iterates.steps if s.own], matrix.size(step), self._options.hard
         if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):

@@ -42,7 +42,8 @@ class Beside:
     present
         The product of that of the present state with a vector, dear; None if nothing is older. Collective.
     foreseen
-        The same product as foreseen from states where forces are known, cheap; None if nothing is older. Collective.
+        The same product as foreseen from states where forces are known, cheap; None if nothing is
+        older. Collective.
     """
 
     K: PETSc.Mat
@@ -52,7 +53,8 @@ class Beside:
     foreseen: Callable[[Vector], Vector] | None = None
 
     def change(self, v: Vector) -> Vector:
-        """Return the product of v with what is foreseen beyond the older part; zero if nothing is older. Collective."""
+        """Return the product of v with what is foreseen beyond the older part; zero if nothing is
+        older. Collective."""
         if self.foreseen is None or self.changing is None:
             return np.zeros_like(v)
         return np.asarray(self.foreseen(v) - self.changing.times(v))

@@ -46,7 +46,8 @@ class Instability:
 
 
 class Clustered(PathStopped):
-    """Several instabilities, between `point` and `high`, are not parted by the points that can be found there."""
+    """Several instabilities, between `point` and `high`, are not parted by the points that can be
+    found there."""
 
     def __init__(self, point: Point, high: Point) -> None:
         super().__init__("several instabilities lie too close to each other", point)
@@ -237,10 +238,10 @@ class _Search:
     def refuse_apart(self, low: Point, high: Point) -> None:
         """Refuse two points that are not on one path.
 
-        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket with an end on each
-        shrinks to nothing in s and contains no instability.
+        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket
+        with an end on each shrinks to nothing in s and contains no instability.
         """
-        if self.path.apart(low, high, PARTED):
+        if self.path.are_apart(low, high, PARTED):
             raise PathStopped("the step jumped to another branch", low)
 
     def spent(self, point: Point) -> Point:
@@ -406,8 +407,9 @@ class Walk:
     done
         Whether the last point ends the walk.
     clusters
-        The first points before, and behind, instabilities that were not parted. Such a cluster counts as one
-        instability, at the first of both points; its width is the error of the amplitude.
+        The first points before, and behind, instabilities that were not parted. Such a cluster
+        counts as one instability, at the first of both points; its width is the error of the
+        amplitude.
     """
 
     def __init__(
@@ -439,6 +441,7 @@ class Walk:
                 if state:
                     try:
                         self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                        self._allowance.end = None  # it has the amplitudes before
                         break
                     except PathStopped as e:
                         if self._renew and self._renew(low, point):  # nearer to the first point the change is smaller
@@ -475,7 +478,8 @@ class Walk:
             self.path = self.path.in_steps(replace(options, first=shorter, several=several))
 
     def _steps(self) -> Iterator[tuple[Point, bool]]:
-        """Points ahead, as `Path.towards` has them; the end of an earlier step where none is found before a cluster."""
+        """Points ahead, as `Path.towards` has them; the end of an earlier step where none is found
+        before a cluster."""
         try:
             yield from self.path.towards(self.points[-1], self._ahead(), self._arrive)
         except PathStopped:
@@ -483,7 +487,7 @@ class Walk:
             if not (allowance.end and allowance.clustered):
                 raise
             end = self.path.as_base(self.path.measured_from(here, allowance.end))
-            allowance.repeated = MOST_REPEATED
+            allowance.repeated, allowance.end = MOST_REPEATED, None  # it is tried once
             yield end, end.s in self._ahead()
             yield from self._steps()
 
@@ -558,7 +562,8 @@ class Walk:
             raise
 
     def _cluster(self, low: Point, high: Point) -> Instability:
-        """Instabilities between two points as one: a fold if the amplitude turns back between them."""
+        """Instabilities between two points as one: a fold if the amplitude turns back between
+        them."""
         name = self.path.name
         point = replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
         self.clusters.append((point, high))

@@ -411,7 +411,8 @@ def _softest(factors: Factorisation, near: Vector | None) -> tuple[float, Vector
 
 
 def _between_looks(along: Sequence[float], numbers: Sequence[Vector]) -> Vector:
-    """What a parabola through three has, in the mean, between the last two: its inner Bernstein coefficient there."""
+    """What a parabola through three has, in the mean, between the last two: its inner Bernstein
+    coefficient there."""
     (other, low, high), (before, first, last) = along, numbers
     step = high - low
     slopes = (last - first) / step, (first - before) / (low - other)

@@ -305,7 +305,8 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
 
 
 def _nearest_two(kept: Array, away: Array) -> str:
-    """The two nearest places (n, 3) along an edge that are not one, with all digits that tell them apart."""
+    """The two nearest places (n, 3) along an edge that are not one, with all digits that tell them
+    apart."""
     all_of_them = np.vstack([kept, away])
     apart = np.linalg.norm(all_of_them[:, None] - all_of_them[None], axis=2)
     apart[apart <= SAME] = np.inf

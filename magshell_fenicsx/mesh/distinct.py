@@ -1,8 +1,10 @@
-"""Which places are distinct enough to be vertices of one mesh, and triangles that are too flat for their neighbours.
+"""Which places are distinct enough to be vertices of one mesh, and triangles that are too flat for
+their neighbours.
 
-The interior penalty of an edge is over the mean height of its two triangles. Where one is lower than about a hundredth
-of the other, the default penalty is too small, whatever the degree. So vertices that are nearer to each other than a
-part of the elements there share a grid line, or are refused.
+The interior penalty of an edge is over the mean height of its two triangles. Where one is lower
+than about a hundredth of the other, the default penalty is too small, whatever the degree. So
+vertices that are nearer to each other than a part of the elements there share a grid line, or are
+refused.
 """
 
 from collections.abc import Callable
@@ -14,15 +16,15 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, directed_sides
 
 Array = NDArray[np.float64]
 SAME_PLACE = 1e-6  # over R: nearer places are one, and a place so near to an edge is on it
-NEAR = 0.02  # of the element size: with nearer vertices cells are too flat; with half of that a plate is unstable
+NEAR = 0.02  # of the element size: nearer vertices make cells too flat; at half of it plates are unstable
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
-FLAT = 25.0  # `flatness` from where meshes of the default penalty may be unstable: 26 to 37 in grids, 32 to 47 by gmsh
+FLAT = 25.0  # `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
 SHORT = 0.05  # a side over another one, from where its ends are told
 TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 
 
-def gathered(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
+def grouped_by_distance(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
     """Return groups of sorted coordinates (n,), each of which has one grid line.
 
     Parameters
@@ -38,25 +40,29 @@ def gathered(coordinates: Array, size: Callable[[float], float], rounding: float
             groups[-1] = np.append(groups[-1], c)
         else:
             groups.append(np.array([c]))
-    return [part for group in groups for part in _halved(group, max(rounding, WIDEST * size(float(group.mean()))))]
+    return [
+        part for group in groups for part in _narrow_parts(group, max(rounding, WIDEST * size(float(group.mean()))))
+    ]
 
 
 def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]) -> list[float]:
-    """Return one coordinate for each of the `gathered` groups that lie between two ends and beside none of them."""
+    """Return one coordinate for each group of near ones that lies between two ends, and beside none
+    of them."""
 
-    def inside(x: float) -> bool:
+    def is_inside(x: float) -> bool:
         return min(x - ends[0], ends[1] - x) > max(SAME_PLACE, NEAR * size(x))
 
-    groups = gathered(np.array([x for x in coordinates if inside(float(x))]), size, SAME_PLACE)
+    groups = grouped_by_distance(np.array([x for x in coordinates if is_inside(float(x))]), size, SAME_PLACE)
     return [float(group[0] + group[-1]) / 2 for group in groups]
 
 
-def _halved(group: Array, widest: float) -> list[Array]:
-    """The group, or as many parts of it as have at most that width."""
+def _narrow_parts(group: Array, widest: float) -> list[Array]:
+    """Return a group of sorted coordinates (n,), or halves of halves of it that are no wider than
+    `widest`."""
     if np.ptp(group) <= widest:
         return [group]
     lower = group < (group[0] + group[-1]) / 2
-    return [*_halved(group[lower], widest), *_halved(group[~lower], widest)]
+    return [*_narrow_parts(group[lower], widest), *_narrow_parts(group[~lower], widest)]
 
 
 def told_apart(one: Array, other: Array) -> tuple[str, str]:
@@ -70,9 +76,11 @@ def told_apart(one: Array, other: Array) -> tuple[str, str]:
 
 
 def flatness(patch: PatchMesh) -> Array:
-    """Return for each triangle (m,) how many times as high its neighbours are: sum (h + h') / (4 h) over its sides.
+    """Return for each triangle (m,) how many times as high its neighbours are: sum (h + h') / (4 h)
+    over its sides.
 
-    h and h' are the heights of the triangle and of its neighbour over a side. Alike triangles have 1.5.
+    h and h' are the heights of the triangle and of its neighbour over a side. Alike triangles have
+    1.5.
     """
     corners = patch.embedding(patch.nodes)[patch.cells[:, :3]]
     sides = corners[:, [1, 2, 0]] - corners
@@ -87,7 +95,8 @@ def flatness(patch: PatchMesh) -> Array:
 
 
 def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: float, words: str) -> str:
-    """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none is.
+    """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none
+    is.
 
     Parameters
     ----------
@@ -96,28 +105,30 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
     length
         R in the coordinates of the message, which `words` name.
     """
-    flat = flatness(patch)
-    worst = int(flat.argmax())
-    if flat[worst] * default <= FLAT * penalty:
+    ratios = flatness(patch)
+    worst = int(ratios.argmax())
+    if ratios[worst] * default <= FLAT * penalty:
         return ""
     corners = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
     x, y, z = corners.mean(axis=0)
     sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
-    low = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
-    near = ""
+    height = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
+    near_vertices = ""
     if sides.min() < SHORT * sides.max():
         side = int(sides.argmin())
         one, other = told_apart(corners[side], corners[(side + 1) % 3])
-        near = f", with vertices at ({one}) and ({other})"
-    hint = _or_penalty(float(flat[worst]), default)
+        near_vertices = f", with vertices at ({one}) and ({other})"
+    hint = _or_penalty(float(ratios[worst]), default)
     return (
-        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {low:.3g} high and {sides.max():.3g} long{near}"
-        f", too flat beside its neighbours: make triangles of like heights there{hint}"
+        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {words}, is {height:.3g} high "
+        f"and {sides.max():.3g} long{near_vertices}, too flat beside its "
+        f"neighbours: make triangles of like heights there{hint}"
     )
 
 
 def _or_penalty(flat: float, default: float) -> str:
-    """The penalty that stands triangles so flat, as a hint; empty where none does."""
+    """Return a hint at the penalty that stands triangles of this `flatness`; empty where none
+    does."""
     if not flat < TOO_FLAT:
         return ""
     return f", or take mesh.penalty: {np.ceil(default * flat / FLAT / 100) * 100:g}"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.distinct import NEAR, gathered
+from magshell_fenicsx.mesh.distinct import NEAR, grouped_by_distance
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
 from magshell_fenicsx.mesh.shapes import Faces, Glued, within
 
@@ -33,7 +33,7 @@ class Grid:
         Whether the two ends of each axis are one line of the surface.
     through
         Coordinates across each axis at which there is a straight grid line.
-    loose
+    movable
         Coordinates at which there is one too, that near places may draw to themselves.
     """
 
@@ -43,7 +43,7 @@ class Grid:
     sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
     glued: tuple[bool, bool] = (False, False)
     through: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
-    loose: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    movable: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def edges(self) -> tuple[str, ...]:
@@ -86,8 +86,8 @@ class Grid:
         """
         low, high = self.low[axis], self.high[axis]
         straight = self._straight(axis)
-        loose = [middle for _, middle in self._gathered(axis, points)]
-        given = np.unique([*straight, *loose])
+        movable = [middle for _, middle in self._groups(axis, points)]
+        given = np.unique([*straight, *movable])
         given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
         given[-1] = high
         x, sides = self._counts[axis]
@@ -109,29 +109,32 @@ class Grid:
         lines = np.unique([low, high, *self.through[axis]])
         return np.asarray(lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])])
 
-    def beside(self, axis: int, x: float) -> float | None:
-        """The straight line that a coordinate is too near to for a line of its own, or on; None if there is none."""
+    def straight_line_at(self, axis: int, x: float) -> float | None:
+        """The straight line that a coordinate is too near to for a line of its own, or on; None if
+        there is none."""
         straight = self._straight(axis)
         nearest = float(straight[np.abs(straight - x).argmin()])
         rounding = CLOSE * (self.high[axis] - self.low[axis])
         return nearest if abs(nearest - x) <= max(rounding, NEAR * self.size_at(axis, x)) else None
 
-    def _gathered(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
-        """Groups of coordinates that are near each other, beside no straight line, and the line of each."""
+    def _groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
+        """Groups of coordinates that are near each other, beside no straight line, and the line of
+        each."""
         rounding = CLOSE * (self.high[axis] - self.low[axis])
-        given = np.unique([*(float(x[axis]) for x in points), *self.loose[axis]])
-        free = np.array([x for x in given if self.beside(axis, float(x)) is None])
-        groups = gathered(free, lambda x: self.size_at(axis, x), rounding)
+        given = np.unique([*(float(x[axis]) for x in points), *self.movable[axis]])
+        free = np.array([x for x in given if self.straight_line_at(axis, float(x)) is None])
+        groups = grouped_by_distance(free, lambda x: self.size_at(axis, x), rounding)
         return [(g, float(g[0] if np.ptp(g) <= rounding else (g[0] + g[-1]) / 2)) for g in groups]
 
     def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
-        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the first."""
+        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the
+        first."""
         numbers = np.zeros((len(points), 2), dtype=np.int64)
         for axis in range(2):
-            lines, groups = self.lines(axis, points), self._gathered(axis, points)
+            lines, groups = self.lines(axis, points), self._groups(axis, points)
             for i, point in enumerate(points):
                 x = float(point[axis])
-                line = self.beside(axis, x)
+                line = self.straight_line_at(axis, x)
                 if line is None:
                     line = next(middle for group, middle in groups if group[0] <= x <= group[-1])
                 number = int(np.abs(lines - line).argmin())
@@ -154,7 +157,7 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
     n, m = len(x) - 1, len(y) - 1
     vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    _draw(vertices, grid, points)
+    _draw_to_points(vertices, grid, points)
     centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
     nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
     number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
@@ -176,7 +179,7 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one)
 
 
-def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
+def _draw_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
     """Move vertices (n, m, 2) to the points that take them, where lines are not exactly there.
 
     Raises
@@ -196,7 +199,7 @@ def _draw(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
         if (np.abs(apart) > CLOSE * extent).any():
             raise MeshError(f"the points {before} and {name} are too near to each other for the elements there")
         for axis in range(2):
-            line = grid.beside(axis, float(place[axis]))
+            line = grid.straight_line_at(axis, float(place[axis]))
             end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
             if abs(off[axis]) <= CLOSE * extent[axis]:
                 off[axis] = 0.0
@@ -248,7 +251,7 @@ class RimmedGrid:
         near = [p for p in images if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()]
         surfaces = [rectangle(), *within(occ, near, rectangle)]
         for axis, other in ((0, 1), (1, 0)):
-            for across in (*self.grid.through[axis], *self.grid.loose[axis]):
+            for across in (*self.grid.through[axis], *self.grid.movable[axis]):
                 if not self.grid.low[axis] < across < self.grid.high[axis]:
                     continue
                 ends = np.array([self.grid.low, self.grid.high])

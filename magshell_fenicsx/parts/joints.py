@@ -134,7 +134,8 @@ class Joined(KeyAbility[Sequence[JointSection]]):
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
-    """See that a spring is not stiffer than rounding allows, beside the softer of its two shells."""
+    """See that a spring is not stiffer than rounding allows, beside the softer of its two
+    shells."""
     shells, softest = context.sections["shells"], inf
     for edge in section.edges:
         owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]

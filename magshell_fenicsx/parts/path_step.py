@@ -162,7 +162,8 @@ class PathStep(Step):
 
     @property
     def bound(self) -> tuple[Target, float] | None:
-        """With `until: limit`: where the way ends at the latest, and its direction; None without."""
+        """With `until: limit`: where the way ends at the latest, and its direction; None
+        without."""
         if self.until != "limit":
             return None
         return next(((self.targets[key], value) for key, value in self._given.items()), None)

@@ -55,9 +55,9 @@ def open_standard_streams() -> None:
 def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Two functions: the first prints a line, the second rewrites the status line.
 
-    If standard output is no terminal, or there are several ranks, the second prints a line where EACH seconds have
-    passed without one, and again after as many more. The status line is erased after `with`, and also when SIGTERM ends
-    the process.
+    If standard output is no terminal, or there are several ranks, the second prints a line where
+    EACH seconds have passed without one, and again after as many more. The status line is erased
+    after `with`, and also when SIGTERM ends the process.
     """
     if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         yield from _plain(say)
@@ -86,7 +86,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
 
 
 def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
-    """Both functions print lines, the second seldom; the last status is repeated while nothing else is said."""
+    """Both functions print lines, the second seldom; the last status is repeated while nothing else
+    is said."""
     last, status, lock, ended = time.monotonic(), ("", 0.0), threading.Lock(), threading.Event()
 
     def stay(line: str) -> None:

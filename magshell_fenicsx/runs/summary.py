@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-BEGUN, DONE = 0.1, 0.9  # of the way of a snap: between them it jumps
+JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # of the way of a snap: between them it jumps
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the motions that begin at a fold and end at rest (`then: snap`).
 
-    `time` is from the release until the deflection is half way, in the unit of the column time; `departure` until it
-    has done a tenth of the way, which grows without limit as the push at the fold vanishes; `jump` from there until it
-    has done nine tenths. `overshoot` is the largest deflection beyond the last, over the way; `dissipated` the energy
-    over E h R^2.
+    `time` is from the release until the deflection is half way, in the unit of the column time;
+    `departure` until it has done a tenth of the way, which grows without limit as the push at the
+    fold vanishes; `jump` from there until it has done nine tenths. `overshoot` is the largest
+    deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
     """
     at_rest = []
     for i, fold in ((i, row) for i, row in enumerate(rows[:-1]) if row["label"] == "fold"):
@@ -51,7 +51,7 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
         way = (w - w[0]) / (w[-1] - w[0])
         # the last two rows are of one time
-        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (BEGUN, 0.5, DONE))
+        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (JUMP_BEGINS, 0.5, JUMP_ENDS))
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
         times = {"time": half, "departure": begun, "jump": done - begun}
         at_rest.append({**ends, **times, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
@@ -64,7 +64,8 @@ def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
 
 
 def _first_at(part: float, times: Array, way: Array) -> float:
-    """Return the first time at which a part of a way is done, by cubic interpolation; the last if it is not by then."""
+    """Return the first time at which a part of a way is done, by cubic interpolation; the last if
+    it is not by then."""
     if not (way >= part).any():  # a creeping shell is put to rest from afar
         return float(times[-1])
     at = int(np.argmax(way >= part))

@@ -169,7 +169,8 @@ def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
 
 
 def _off_shell(at: At, ground: Ground) -> str:
-    """Why a direction from the centre of a sphere is not on the part that there is, after the key `at`."""
+    """Why a direction from the centre of a sphere is not on the part that there is, after the key
+    `at`."""
     hole, edge = ground.hole_polar, ground.edge_polar or 0.0
     if hole and "polar" not in at.model_fields_set:
         return f": is not given, and the pole is in the hole of the shell: give polar, {hole:g} to {edge:g}"

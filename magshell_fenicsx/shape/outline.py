@@ -344,7 +344,7 @@ def _between(grid: Grid, sector: Sector) -> Grid:
         high=(end, grid.high[1]),
         sides=sides,
         glued=(False, grid.glued[1]),
-        loose=(parts, grid.loose[1]),
+        movable=(parts, grid.movable[1]),
     )
 
 

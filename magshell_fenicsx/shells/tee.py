@@ -195,10 +195,10 @@ class Tee(Tie):
         log: KernelLog,
     ) -> None:
         surfaces = Surfaces.of(r0)
-        at = surfaces.foot(foot, on)
+        at = surfaces.foot_of(foot, on)
         at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
         nodes = surfaces.cells.nodes
-        both = np.concatenate([nodes[at.cell], nodes[at.other]], axis=1)
+        both = np.concatenate([nodes[at.cell], nodes[at.other_cell]], axis=1)
         of_cells = surfaces.cells.gathered(stiffness)
         half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
         on_other = surfaces.shapes(at.Y)
@@ -213,7 +213,7 @@ class Tee(Tie):
             np.einsum("nk,cd->nckd", beta, axes).reshape(len(at.x), 3, count),
             np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), PARTS, count),
             at.along,
-            _stiff(joint, material, np.maximum(of_cells[at.cell], of_cells[at.other]), at.length, at.weight),
+            _stiff(joint, material, np.maximum(of_cells[at.cell], of_cells[at.other_cell]), at.length, at.weight),
             log,
         )
 
@@ -224,7 +224,7 @@ class Foot:
 
     Attributes
     ----------
-    cell, other
+    cell, other_cell
         (n,) global numbers of the cells of both.
     on_edge
         (3, n, functions): shape functions of the edge's cells at the points, and their derivatives.
@@ -236,8 +236,9 @@ class Foot:
         (n,) the length for which a point stands, and that of its cell's side.
     Y, apart
         (n, 2) the places in their cells, and (n,) their distances, inf without a cell.
-    within
-        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of these cells.
+    clearance
+        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of
+        these cells.
     """
 
     cell: Longs
@@ -246,10 +247,10 @@ class Foot:
     along: Array
     weight: Array
     length: Array
-    other: Longs
+    other_cell: Longs
     Y: Array
     apart: Array
-    within: float
+    clearance: float
 
     def refuse_misplaced(self, comm: MPI.Comm, h: float, key: str, joint: Joint) -> None:
         """See that the edge is on the other shell, and its own shell is not; collective.
@@ -260,7 +261,7 @@ class Foot:
             On every rank, with the place and how far it is.
         """
         _refuse_apart(comm, self.apart, self.x, h, key, joint)
-        if min(comm.allgather(self.within)) < APART * h:
+        if min(comm.allgather(self.clearance)) < APART * h:
             foot, other = joint.edges
             raise MeshError(
                 f"{key}: the shell of the edge {foot} lies in the mid-surface of {other}, where both take the same "
@@ -294,11 +295,19 @@ class Surfaces:
         return self.V.element.basix_element
 
     def shapes(self, X: Array) -> Array:
-        """(3, n, functions): shape functions at places and their derivatives."""
+        """Return (3, n, functions): shape functions at places and their derivatives."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
-    def foot(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> Foot:
-        """The points of an edge on this rank, given by local facets, on the shell of some local cells; collective."""
+    def foot_of(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> Foot:
+        """Return the foot of an edge on another shell; collective.
+
+        Parameters
+        ----------
+        facets
+            Local ones of the edge.
+        on
+            Which local cells are of the other shell.
+        """
         first, nodes = self.cells.own.start, self.cells.nodes
         cells, ends = _sides(self.V, facets, len(self.cells.own))
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
@@ -311,13 +320,13 @@ class Surfaces:
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
         shell = np.flatnonzero(self.cells.gathered(on))
-        other, Y, apart = self.nearest(x, shell)
+        other, Y, apart = self.nearest_places(x, shell)
         beside = self.r0[nodes[first + cells]]
-        far = self.nearest(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
-        within = float(far.max(axis=1, initial=0.0).min(initial=np.inf))
-        return Foot(cell, on_edge, x, along, weight, length, other, Y, apart, within)
+        far = self.nearest_places(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
+        clearance = float(far.max(axis=1, initial=0.0).min(initial=np.inf))
+        return Foot(cell, on_edge, x, along, weight, length, other, Y, apart, clearance)
 
-    def nearest(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
+    def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance, inf without a cell."""
         from scipy.spatial import cKDTree  # takes long to import
 
@@ -397,12 +406,13 @@ class MeridianTee(Tie):
 
 
 def _ends_of_cells(V: fem.FunctionSpace) -> Array:
-    """(cells, 2) parameters of the ends of a meridian's cells."""
+    """Return the parameters (cells, 2) of the ends of a meridian's cells."""
     return np.asarray(V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0])
 
 
 def _rings(V: fem.FunctionSpace, tied: tuple[float, float]) -> tuple[list[Longs], list[tuple[Array, Array]]]:
-    """The cells at both parameters of a junction, with their shape functions there and slopes, all in one row."""
+    """Return the cells at both parameters of a junction, with their shape functions there and
+    slopes, all in one row."""
     ends, shapes = _ends_of_cells(V), []
     inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
     cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
@@ -414,7 +424,13 @@ def _rings(V: fem.FunctionSpace, tied: tuple[float, float]) -> tuple[list[Longs]
 
 
 def _refuse_rings_apart(r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint) -> float:
-    """See that the ring of an edge is on the other shell; its radius."""
+    """Return the radius of the ring of an edge, which must be on the other shell.
+
+    Raises
+    ------
+    MeshError
+        If it is not.
+    """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
     cells, shapes = _rings(V, tied)
     (rho, z), other = (N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True))
@@ -486,8 +502,9 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
-def _tied(joints: Sequence[Joint], surface: Midsurface) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
-    """The joints that are T-junctions, with their keys and which cells of this rank the other shell has."""
+def _tee_joints(joints: Sequence[Joint], surface: Midsurface) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
+    """Return the joints that are T-junctions, with their keys and which cells of this rank the
+    other shell has."""
     pairs = enumerate(zip(joints, surface.joints, strict=True))
     tied = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
     return [*tied, *((Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items())]
@@ -501,17 +518,17 @@ def refuse_misplaced_feet(joints: Sequence[Joint], surface: Midsurface, r0: fem.
     MeshError
         On every rank, with the edge.
     """
-    tied = _tied(joints, surface)
+    tied = _tee_joints(joints, surface)
     surfaces = Surfaces.of(r0) if tied else None
     for joint, key, on in tied:
         assert surfaces
-        surfaces.foot(surface.edges[joint.edges[0]], on).refuse_misplaced(r0.function_space.mesh.comm, h, key, joint)
+        surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(r0.function_space.mesh.comm, h, key, joint)
 
 
 def tees(model: "ShellModel") -> list[Tee]:
     """The T-junctions of a model; collective."""
     surface = model.midsurface
-    tied = _tied(model.loads.joints, surface)
+    tied = _tee_joints(model.loads.joints, surface)
     if not tied:
         return []
     edges, factors, log = surface.edges, _factors(model), model.kernels

@@ -61,7 +61,8 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
-    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no numbers.
+    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no
+    numbers.
 
     Raises
     ------
@@ -77,5 +78,5 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     for number in np.unique(part)[1:]:
         own = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)
-        if surfaces.nearest(surfaces.r0[own], others)[2].min(initial=np.inf) < INSIDE * h:
+        if surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf) < INSIDE * h:
             raise CaseError(TOO_NEAR)

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.modes import critical_mode
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
@@ -48,7 +48,7 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    goal, name, h = step.load.target, step.name, scene.problem.material.h
+    goal, name, h = step.load.target or step.load.bound, step.name, scene.problem.material.h
     end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
     region = scene.model.region(state, name)
     if region.penetration > NEAR * h or end <= state.mu[name]:
@@ -73,7 +73,8 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
 
 
 def stiffer(stage: Stage, high: Point) -> dict[str, float]:
-    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given stiffness none."""
+    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given
+    stiffness none."""
     return stiffnesses(stage.scene, stage.leave(high.state))
 
 
@@ -105,12 +106,14 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
 
 
 def recut(stage: Stage, high: Point) -> dict[str, float]:
-    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much better there."""
+    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much
+    better there."""
     return better_cuts(stage.scene, stage.leave(high.state))
 
 
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
-    """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run; collective."""
+    """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run;
+    collective."""
     at = stage.scene.model.system.at(stage.leave(high.state)) if numbers else None
     for each in _with_cuts(stage.scene):
         if at and each.pair.cuts in numbers:
@@ -118,23 +121,32 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
-    """Return the numbers of cuts with closer points of contact, for two points with an instability between them.
+    """Return the numbers of cuts with closer points of contact, for two points with an
+    instability between them.
 
-    Empty if closer points change neither the number of unstable directions of both nor much of their critical modes'
-    stiffness: of an instability that they move, nobody knows whether it is one.
+    Empty if closer points change neither the number of unstable directions of both nor much of
+    their critical modes' stiffness: of an instability that they move, nobody knows whether it is
+    one.
     """
     scene, state = stage.scene, stage.leave(high.state)
     at = scene.model.system.at(state)
     numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}
     closer = {name: number for name, number in numbers.items() if number is not None}
-    certain = not closer or all(_certain(stage, point, closer) for point in (high, low))
+    certain = not closer or all(_is_certain(stage, point, closer) for point in (high, low))
     return {} if certain else closer
 
 
-def _certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
-    """Whether the critical mode's stiffness at a point is certain within `CERTAIN` of it, by closer points."""
+def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
+    """Return whether closer points change no critical mode's stiffness at a point by `CERTAIN` of
+    it.
+
+    True as well if a mode is not found: then nothing says that closer points would help.
+    """
     given, other = point.state, State(point.state.u, {**point.state.mu, **finer})
-    mode, compared = (critical_mode(stage.newton, state) for state in (given, other))
+    try:
+        mode, compared = (critical_mode(stage.newton, state) for state in (given, other))
+    except NoEigenpair:
+        return True
     error = abs(compared.eigenvalue - mode.eigenvalue)
     return compared.negative_pivots == mode.negative_pivots and error < CERTAIN * abs(mode.eigenvalue)
 
@@ -294,7 +306,8 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
 
 
 def penetration_refused(scene: Scene, state: State, *, moving: bool = False) -> str:
-    """How a body penetrates more than its bound, or a shell, and the stiffness that would halve it; "" if none does.
+    """How a body penetrates more than its bound, or a shell, and the stiffness that would halve it;
+    "" if none does.
 
     Where shells hit each other in a motion, their bound is `IMPACT` times as large. Collective.
     """

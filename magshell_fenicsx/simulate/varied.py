@@ -170,7 +170,7 @@ class Varied:
         if earlier and any(how != "load" for how in step.load.hold.values()):
             raise CaseError(f"{step.key}.hold: a boundary needs what is held to be held from the start: give one step")
         for each in earlier:
-            target = each.load.target
+            target = each.load.target or each.load.bound
             if each.load.hold or (target and target[0].quantity == "conjugate"):
                 raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
 
@@ -346,7 +346,7 @@ class Varied:
             return {name: v + rates[name] * (p - at) for name, v in amplitudes.items()}
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
         for before, after in zip(old.programme[: self._record.step - 1], new.programme, strict=False):
-            one, two = before.load.target, after.load.target
+            one, two = (each.load.target or each.load.bound for each in (before, after))
             if one and two and one[0].quantity == "load" and isclose(mu.get(before.name, np.nan), one[1], rel_tol=1e-9):
                 mu[before.name] = two[1]
         given, now = own_amplitudes(old.loads), own_amplitudes(new.loads)

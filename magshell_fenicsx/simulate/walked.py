@@ -71,8 +71,8 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
-    """A walk on which bodies become stiffer, and shells are cut anew and get closer points where these move an
-    instability; magnets on the way and returning bodies end it."""
+    """A walk on which bodies become stiffer, and shells are cut anew and get closer points where
+    these move an instability; magnets on the way and returning bodies end it."""
     checks = _Checks(stage, path, goal.until != "points")
     checks.walk = walk = Walk(path, start, goal, checks)
     return walk
@@ -96,8 +96,9 @@ class _Checks:
 
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
-        self._cut_at = np.nan  # s of the point before the one for which cuts were last made anew: once for each
-        self._begin = np.nan, 0  # s of the first point, and its negative pivots before anything was changed there
+        self._cut_at = np.nan  # s of the point behind which cuts were last made anew: once for each
+        # s of the first point, and its negative pivots before anything was changed there
+        self._begin = np.nan, 0
 
     def __call__(self, low: Point, high: Point) -> State | None:
         """See `Walk`.
@@ -121,7 +122,8 @@ class _Checks:
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
     def _found(self, low: Point, high: Point) -> Finding:
-        """What is between two points: why the second one is refused, or the amplitudes that change."""
+        """Find out why the second of two points is refused, or which amplitudes change before it is
+        solved again."""
         stage = self._stage
         try:
             refuse_crossing(stage, low, high)
@@ -173,7 +175,7 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                     mode = ("symmetric" if crossing_at_point.symmetric else "asymmetric") if crossing_at_point else ""
                 if label == "fold":
                     fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
-                said = cluster(stage.scene, walk, point)
+                said = words_of_cluster(stage.scene, walk, point)
                 yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable, said=said)
                 if abs(point.state.mu[path.name]) > furthest:
                     break
@@ -288,7 +290,7 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
         for label, point in walk:
             for record in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
                 yield replace(record, branch=number)
-            said = cluster(stage.scene, walk, point)
+            said = words_of_cluster(stage.scene, walk, point)
             yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable, said=said)
     except PathStopped as e:
         lost = _why(stage.scene, path, e, walk.points)
@@ -335,8 +337,9 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
         yield Record("bifurcation", path.name, crossing.point, crossing.label, excluded_pivots=crossing.unstable)
 
 
-def cluster(scene: Scene, walk: Walk, point: Point) -> str:
-    """What is said of instabilities that were not parted, at the point that stands for them; "" at any other."""
+def words_of_cluster(scene: Scene, walk: Walk, point: Point) -> str:
+    """Return what is said of instabilities that were not parted, at the point that stands for them;
+    "" at others."""
     behind = next((high for low, high in walk.clusters if low is point), None)
     if behind is None:
         return ""

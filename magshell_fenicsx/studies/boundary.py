@@ -345,7 +345,8 @@ def _followed(
 
 
 def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mode: str) -> dict[str, Any]:
-    """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the whole."""
+    """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
+    whole."""
     families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
     own = "" if varied.m else name_of_mode
     if len(families) > 1 and not families[0]:

@@ -51,7 +51,8 @@ class Scalar:
             points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
             return _number(next(points, None))
         if self.name in OF_SNAPS:
-            return _number(next((snap[OF_SNAPS[self.name]] for snap in summary.get("snaps", ())), None))
+            first: Mapping[str, float] = next(iter(summary.get("snaps", ())), {})
+            return _number(first.get(OF_SNAPS[self.name]))  # earlier versions have `time` alone
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
             return None

@@ -79,9 +79,11 @@ def test_an_older_part_is_corrected_where_the_count_depends_on_it() -> None:
 
 @pytest.mark.parametrize("grown", [1.0, -0.05])
 def test_an_older_part_that_was_small_and_is_not_makes_no_count_certain(grown: float) -> None:
-    """D of an earlier state is noise beside K, that of the present is not: the eigenvalues of NumPy say of which.
+    """D of an earlier state is noise beside K, that of the present is not: the eigenvalues of NumPy
+    say of which.
 
-    Where D has kept its size the count is certain, where it has moved the softest eigenvalue past zero it is not.
+    Where D has kept its size the count is certain, where it has moved the softest eigenvalue past
+    zero it is not.
     """
     K, D = beside([0.02], 0.0, 1e-6)
     soft = np.linalg.eigh(K)[1][:, :1]

@@ -205,7 +205,8 @@ def first_sine(rise: float) -> Toy:
 
 @dataclass
 class WithoutThree(WithoutModes):
-    """The arch's first sine alone. The third family that it excludes touches the second one where the first crosses it.
+    """The arch's first sine alone. The third family that it excludes touches the second one where
+    the first crosses it.
 
     There it is neutral at a thrust that is lower by `gap`.
     """
@@ -229,7 +230,8 @@ class WithoutThree(WithoutModes):
 def test_the_first_of_three_modes_that_meet_is_followed(
     gap: float, missed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two of them differ by their gap alone where all meet, at a rise of 2.8; the third is the first one beyond.
+    """Two of them differ by their gap alone where all meet, at a rise of 2.8; the third is the
+    first one beyond.
 
     It is so as well where crossings with it cannot be located.
     """
@@ -257,7 +259,8 @@ def test_the_first_of_three_modes_that_meet_is_followed(
 
 @pytest.mark.parametrize(("gap", "taken"), [(1e-4, 3), (-1e-3, 2), (0.5, 2)])
 def test_a_start_is_that_of_the_first_of_two_modes_that_are_near(gap: float, taken: int) -> None:
-    """The second mode is named, the third is first by a gap; one that comes long before is another instability."""
+    """The second mode is named, the third is first by a gap; one that comes long before is another
+    instability."""
     toys, rise = WithoutThree(first_sine, gap=gap), 2.75
 
     def curve(m: int, *_: object) -> Boundary:

@@ -38,7 +38,8 @@ def stop() -> Toy:
 
 
 def rows_of_stops(places: list[float]) -> Toy:
-    """Two places in a row on springs of the stiffness 1; the second one, x, meets stops of the stiffness 3.
+    """Two places in a row on springs of the stiffness 1; the second one, x, meets stops of the
+    stiffness 3.
 
     x - q + 3 (sum of x - X over the stops that it has met) = 0 and 2 q - x = load.
     """
@@ -90,7 +91,8 @@ def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
 
 @pytest.mark.parametrize("places", [[0.4], [0.4, 0.3], [0.4, 0.3, 0.1]])
 def test_a_path_passes_corners_just_ahead(places: list[float]) -> None:
-    """Stops at parts of the shortest step ahead. Behind all n of them x = (load + 6 sum of X)/(1 + 6 n)."""
+    """Stops at parts of the shortest step ahead. Behind all n of them x = (load + 6 sum of X)/(1 +
+    6 n)."""
     first, begin = 0.1, 0.5
     shortest = 1e-3 * first
     at = [begin + part * shortest for part in places]

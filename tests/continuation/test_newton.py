@@ -99,7 +99,8 @@ def test_the_linear_solver_serves_others(options: PETSc.Options) -> None:
 
 
 def test_an_older_part_of_a_tangent_is_made_anew_where_steps_do_not_shrink() -> None:
-    """The dear part at u = 0.01 is 50 times too small at the root u = 1 of u + u^2 = 2: each step would be doubled."""
+    """The dear part at u = 0.01 is 50 times too small at the root u = 1 of u + u^2 = 2: each step
+    would be doubled."""
     system = Stiffening()
     newton, start = BorderedNewton(system), np.full(system.size, 0.01)
     newton.factor_at(State(start, {"load": 0.0}))

@@ -1,5 +1,7 @@
 """Walks by arc length on a toy with snap-through, snap-back and a pitchfork, all known in closed form."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap_back
@@ -7,7 +9,7 @@ from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap
 from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions, StepTooLong
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Label, Walk, instabilities
 
@@ -226,6 +228,23 @@ def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> No
     assert events[1].state.mu["load"] == pytest.approx(1.005, rel=1e-8)
 
 
+def test_a_cluster_that_must_not_be_passed_ends_the_walk() -> None:
+    """No step over it is allowed once it is known as one: the end of an earlier step is tried once,
+    not for ever."""
+    walk = along_column(column_of_modes(1e-9, 1e-4), "load", Goal("target", [1.5]))
+    tried = list[float]()
+
+    def refused(low: Point, high: Point) -> None:
+        tried.append(high.s)
+        if low.state.u[0] < 1 < high.state.u[0] and walk._allowance.clustered:
+            raise StepTooLong("too long")
+
+    walk._renew = refused
+    with pytest.raises(PathStopped):
+        list(islice(walk, 1000))
+    assert len(tried) < 200
+
+
 @pytest.mark.parametrize("control", ["load", "arc"])
 def test_modes_too_close_to_part_count_as_one(control: str) -> None:
     walk = along_column(column_of_modes(1e-9), control, Goal("limit"))
@@ -236,7 +255,8 @@ def test_modes_too_close_to_part_count_as_one(control: str) -> None:
 
 
 def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
-    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends at a fold."""
+    """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends
+    at a fold."""
     imperfection = 1e-5
     newton = BorderedNewton(pitchfork(imperfection))
     path, ends = Path(newton, "load", "load", StepOptions(0.4, 0.4, 1e-6)), []

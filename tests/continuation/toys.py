@@ -121,9 +121,11 @@ def snap_back(k: float, c: float) -> Toy:
 
 
 def column_of_modes(distance: float, hidden: float = 0.0, count: int = 2, *others: float) -> Toy:
-    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on, and at others.
+    """u^2/2 + sum (c_i - u) v_i^2/2 + v_i^4/4: modes at the loads c_i, `distance` apart from 1 on,
+    and at others.
 
-    So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in a shell.
+    So near as `hidden` to 1 the residual is not a number, as rounding or divergence hide points in
+    a shell.
     """
     first = np.array([*(1 + distance * np.arange(count)), *others])
     count = len(first)
@@ -184,7 +186,8 @@ def dense(values: Array) -> PETSc.Mat:
 
 
 class Stiffening:
-    """Springs k u + u^2, with a force on the first: the derivative 2 u of the latter is a dear part of the tangent."""
+    """Springs k u + u^2, with a force on the first: the derivative 2 u of the latter is a dear part
+    of the tangent."""
 
     comm = MPI.COMM_SELF
     coordinates = frozenset[str]()

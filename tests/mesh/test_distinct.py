@@ -1,4 +1,5 @@
-"""Points, features and triangles that are near each other: solved right, or refused with both places."""
+"""Points, features and triangles that are near each other: solved right, or refused with both
+places."""
 
 import re
 from pathlib import Path
@@ -46,7 +47,8 @@ def polar(angle: float) -> list[float]:
 
 @pytest.mark.parametrize("apart", [1e-3, 1e-6 * 3])
 def test_a_cantilever_with_two_near_gauges(apart: float) -> None:
-    """Under its weight the end sinks by q L^4/(8 D), 1e-4; there were 10 to 17 unstable directions."""
+    """Under its weight the end sinks by q L^4/(8 D), 1e-4; there were 10 to 17 unstable
+    directions."""
     weight = {"kind": "dead", "control": "load", "loads": [{"over": "all", "per_area": [0, 0, -1e-8]}], "factor": 1}
     gauges = {"tip": [1, 0.25, 0], "A": [0.333, 0.4, 0], "B": [0.333 + apart, 0.1, 0]}
     scene = Scene(case(PLATE, gauges, loading={**weight, "points": 1}))
@@ -126,7 +128,8 @@ REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
 
 @pytest.mark.parametrize(("shell", "points", "symmetry", "said"), REFUSED)
 def test_places_too_near_are_told(shell: dict[str, Any], points: dict[str, Any], symmetry: str, said: str) -> None:
-    """With both places, and digits that show where they differ; `check` and `run` make the problem first."""
+    """With both places, and digits that show where they differ; `check` and `run` make the problem
+    first."""
     with pytest.raises(CaseError, match=re.escape(said)):
         make_problem(case(shell, points, symmetry=symmetry))
 
@@ -137,7 +140,8 @@ def test_digits_that_tell_apart() -> None:
 
 
 def columns(file: Path, width: float) -> Path:
-    """A strip of 1 by 0.2, triangles of 0.2 by 0.1, with one column of them that is as wide as said."""
+    """A strip of 1 by 0.2, triangles of 0.2 by 0.1, with one column of them that is as wide as
+    said."""
     x = np.sort([*np.linspace(0, 1, 6), 0.4 + width])
     nodes = [(a, b, 0) for a in x for b in (0, 0.1, 0.2)]
     n = len(x) - 1
@@ -168,7 +172,8 @@ def of_file(file: Path, **mesh: Any) -> Case:
 
 
 def test_a_flat_triangle_of_a_file(tmp_path: Path) -> None:
-    """It is named, with the penalty that helps; with that the end rises by F L^3/(3 D b), a beam's, 1e-4."""
+    """It is named, with the penalty that helps; with that the end rises by F L^3/(3 D b), a beam's,
+    1e-4."""
     file, said = columns(tmp_path / "a.msh", 1e-3), r"unstable in \d+ directions: the triangle around \(0.400[36]"
     with pytest.raises(Stopped, match=said) as e:
         list(follow(Scene(of_file(file))))
@@ -197,7 +202,8 @@ def test_rims_that_nearly_meet_share_a_vertex() -> None:
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "none"])
 def test_two_dimples_of_nearly_one_width(symmetry: str) -> None:
-    """The undeformed cap is stable: the meridian had one unstable direction, the surface 1e5 cells."""
+    """The undeformed cap is stable: the meridian had one unstable direction, the surface 1e5
+    cells."""
     dimples = [{"kind": "dimple", "amplitude": 0.1, "width": width} for width in (2.0, 2.002)]
     data = {
         "shell": {**CAP, "thickness": 0.01, "imperfections": dimples},

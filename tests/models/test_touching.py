@@ -205,7 +205,8 @@ def test_nearest_places() -> None:
 
 @pytest.mark.parametrize("thickness", [0.036, 0.024])
 def test_the_least_gap_of_shells_that_are_apart(thickness: float) -> None:
-    """As of the search for all places within the reach, in few of these; with the images of a sector."""
+    """As of the search for all places within the reach, in few of these; with the images of a
+    sector."""
     cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "poisson_ratio": 0.3, "youngs_modulus": 1}
     lower, upper = ({"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, thickness))
     shells = {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}}

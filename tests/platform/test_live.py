@@ -166,7 +166,8 @@ def test_a_pipe_gets_a_line_each_half_minute(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_pipe_gets_the_last_status_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also while long work tells nothing new, such as 90 s for one point; nothing before the first status."""
+    """Also while long work tells nothing new, such as 90 s for one point; nothing before the first
+    status."""
     monkeypatch.setattr(terminal, "EACH", 0.1)
     printed: list[str] = []
     with live_line(2, printed.append) as (say, tell):

@@ -57,7 +57,8 @@ def test_clamped_plate_by_half_and_whole() -> None:
 
 
 def band_of_triangles(rows: int, around: int, *, closed: bool = True) -> NDArray[np.int64]:
-    """The triangles between rows of nodes; of rows that are closed the last nodes are beside the first."""
+    """The triangles between rows of nodes; of rows that are closed the last nodes are beside the
+    first."""
     row, node = (x.ravel() for x in np.meshgrid(np.arange(rows - 1), np.arange(around - (not closed)), indexing="ij"))
     beside = (node + 1) % around
     a, b, c, d = row * around + node, row * around + beside, (row + 1) * around + node, (row + 1) * around + beside
@@ -69,7 +70,8 @@ def drawn_mode(r0: NDArray[np.float64], w: NDArray[np.float64], cells: NDArray[n
 
 
 def test_a_dent_between_small_elements_has_no_waves() -> None:
-    """Points of a ring count by their distance: most of them are in a dent, which a wave of few crests fits there."""
+    """Points of a ring count by their distance: most of them are in a dent, which a wave of few
+    crests fits there."""
     theta = np.concatenate([np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)[1:-1]])
     rim = np.column_stack([np.cos(theta), np.sin(theta), 1e-3 * np.sin(theta)])  # it is not even
     r0 = np.concatenate([rim, rim + np.array([0.0, 0.0, 1.0])])
@@ -306,9 +308,11 @@ def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | N
 @pytest.mark.parametrize("staggered", [0.0, 1 / 3, 0.5])
 @pytest.mark.parametrize(("m", "resolved"), [(2, True), (3, True), (5, True), (8, False)])
 def test_waves_are_counted_whatever_nodes_lie_on_rings(m: int, staggered: float, resolved: bool) -> None:
-    """cos(m theta) at 21 nodes around, on rows so near that one ring has three: there 63 - m and 42 + m fit as well.
+    """cos(m theta) at 21 nodes around, on rows so near that one ring has three: there 63 - m and 42
+    + m fit as well.
 
-    Where rows are staggered, a row's nodes are between those of the next. Eight waves have less than three nodes each.
+    Where rows are staggered, a row's nodes are between those of the next. Eight waves have less
+    than three nodes each.
     """
     node, row = (x.ravel() for x in np.meshgrid(np.arange(21), np.arange(41)))
     theta, z = 2 * np.pi * (node + staggered * row) / 21, 0.015 * row
@@ -322,7 +326,8 @@ def test_waves_are_counted_whatever_nodes_lie_on_rings(m: int, staggered: float,
 
 
 def test_waves_are_counted_on_an_irregular_mesh() -> None:
-    """cos(3 theta) at nodes of which no two have one height, the largest of all 0.07 R from the next."""
+    """cos(3 theta) at nodes of which no two have one height, the largest of all 0.07 R from the
+    next."""
     chance = np.random.default_rng(0)
     node, row = (x.ravel() for x in np.meshgrid(np.arange(24), np.arange(9)))
     theta = 2 * np.pi * (node + row / 2 + 0.3 * chance.uniform(-0.5, 0.5, len(node))) / 24

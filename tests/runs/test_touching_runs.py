@@ -81,17 +81,16 @@ LOOKS = [(Facing, "places_in"), (MeridianTouching, "_found"), (Waves, "counts")]
 FEW = 4  # looks of the undeformed shells, and of the last point
 
 
-@pytest.mark.parametrize(
-    ("symmetry", "mesh"),
-    [("auto", {"refinement": 0.3}), pytest.param("half", {"size": 0.15}, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("symmetry", "mesh"), [("auto", {"refinement": 0.3}), ("half", {"size": 0.15})])
 def test_a_resumed_run_looks_at_no_known_contact_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pictures: None, symmetry: str, mesh: dict[str, Any]
 ) -> None:
-    """The folder as it was at a moment after the touch, as kill -9 leaves it; the same rows to the last digit.
+    """The folder as it was at a moment after the touch, as kill -9 leaves it; the same rows to the
+    last digit.
 
-    Where shells touch, what is found at points costs as much as the points: places that face each other, and modes
-    that the model excludes.
+    Where shells touch, what is found at points costs as much as the points: places that face each
+    other, and modes that the model excludes.
     """
     case, whole, killed = tmp_path / "case.yaml", tmp_path / "whole", tmp_path / "killed"
     case.write_text(json.dumps(pressed_caps(0.03, 3, **mesh) | {"symmetry": symmetry}))
@@ -128,7 +127,8 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
 @pytest.mark.slow
 @pytest.mark.parametrize("symmetry", ["half", 6])
 def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> None:
-    """Just after the touch a half and a sector on two ranks have the force of the meridian, another discretisation."""
+    """Just after the touch a half and a sector on two ranks have the force of the meridian, another
+    discretisation."""
     models = {
         "meridian": (0, {"symmetry": "auto"}),
         "other": (2, {"symmetry": symmetry, "mesh": {"size": 0.15, "degree": 3}}),

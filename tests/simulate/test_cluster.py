@@ -1,4 +1,5 @@
-"""What is said of instabilities that a walk has passed without parting them, on modes whose loads are known."""
+"""What is said of instabilities that a walk has passed without parting them, on modes whose loads
+are known."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -13,7 +14,7 @@ from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.walked import cluster
+from magshell_fenicsx.simulate.walked import words_of_cluster
 
 WITHOUT_UNITS = cast("Scene", SimpleNamespace(sizes=SimpleNamespace(column=lambda name: None)))
 
@@ -25,7 +26,7 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
     u[0] = 0.9
     path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.03, 0.03, 1e-6))
     walk = Walk(path, path.start(State(u, {"load": 0.9})), Goal("target", [1.1]))
-    sentences = [(point, said) for _, point in walk if (said := cluster(WITHOUT_UNITS, walk, point))]
+    sentences = [(point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))]
     ((point, said),) = sentences
     first, last = (end.state.mu["load"] for end in walk.clusters[0])
     assert said == (

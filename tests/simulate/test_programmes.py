@@ -217,7 +217,8 @@ def test_a_step_that_cannot_be_done(steps: Sequence[dict[str, Any]], said: str) 
 
 
 def test_first_instability_on_the_way_to_a_target() -> None:
-    """A field of -3 times is three times the opposite one: the same fold; before it there is none."""
+    """A field of -3 times is three times the opposite one: the same fold; before it there is
+    none."""
     load = {"kind": "field", "until": "limit", "points": 2}
     dome = {"geometry": "cap", "polar": 40, "radius": 20, "thickness": 1, "poisson_ratio": 0.49}
     critical = []
@@ -233,6 +234,19 @@ def test_first_instability_on_the_way_to_a_target() -> None:
     *_, last = follow(Scene(near), remark=said.append)
     assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
     assert said == ["step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"]
+
+
+def test_a_way_that_ends_before_the_first_contact_ends_there() -> None:
+    """A ball 4.5 h from a cap approaches by 1 h: it does not go to the cap first, and back then."""
+    cap = {"geometry": "cap", "radius": 1, "polar": 30, "thickness": 0.05, "poisson_ratio": 0.3}
+    ball = {"kind": "sphere", "radius": 0.5, "position": [0, 0, 1.75], "direction": [0, 0, -1]}
+    load = {"kind": "contact", "until": "limit", "approach": 1}
+    data = {"shell": cap, "boundary": {"rim": "clamped"}, "bodies": {"ball": ball}, "loading": load}
+    records = [*follow(Scene(Case.model_validate(data)), remark=lambda said: None)]
+    assert [(record.label, record.point.state.mu["approach"]) for record in records] == [
+        ("start", 0.0),
+        ("target", 1.0),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,8 @@ def test_a_resumed_snap_is_the_same() -> None:
 
 @pytest.mark.parametrize("late", [20.0, 60.0])
 def test_departure_and_jump(late: float) -> None:
-    """A logistic way goes from 0.1 to 0.9 in 2 ln 9 of its time, whenever it departs; the verdict says of what."""
+    """A logistic way goes from 0.1 to 0.9 in 2 ln 9 of its time, whenever it departs; the verdict
+    says of what."""
     t = np.concatenate([np.linspace(0, late + 30, 161), [late + 30]])
     way = 1 / (1 + np.exp(late - t))
     common = {"step": 1, "amplitude": "time", "dissipated": 0.0}

@@ -343,6 +343,7 @@ def test_the_program_of_the_howto_on_one_two_and_three_ranks(tmp_path: Path) -> 
         ({"radius": "25 mm", "thickness": "2 mm", "unit": "mm"}, ""),
         ({"radius": "25 m", "thickness": "0.2 m"}, ""),
         ({"radius": 25, "thickness": 2}, ""),
+        ({"radius": "-25 mm", "thickness": "2 m"}, ""),
     ],
 )
 def test_a_mesh_in_mm_is_not_in_metres(dome: Dome, sizes: dict[str, Any], message: str) -> None:

@@ -109,7 +109,8 @@ def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_mode_has_one_name_in_both_files(tmp_path: Path) -> None:
-    """A high arch buckles to one side: path.csv of its half and boundary.csv, on the whole, call it antisymmetric."""
+    """A high arch buckles to one side: path.csv of its half and boundary.csv, on the whole, call it
+    antisymmetric."""
     setting = f"{KEY}=2.6"
     run = magshell("run", ARCH, "--set", setting, "--out", tmp_path / "run", "--no-pictures")
     assert run.returncode == 0, run.stderr
@@ -393,7 +394,8 @@ def neutral_compression(stiffness: float, m: int) -> float:
 
 @pytest.mark.slow
 def test_where_three_modes_meet_the_first_is_followed(tmp_path: Path) -> None:
-    """A clamped plate that grows on a foundation, by its Bessel functions: m = 1 up to k R⁴/D = 722.62, then m = 0.
+    """A clamped plate that grows on a foundation, by its Bessel functions: m = 1 up to k R⁴/D =
+    722.62, then m = 0.
 
     There m = 2 is neutral at the same load, and beyond it comes later than m = 0, by 1 % at 1100.
     """

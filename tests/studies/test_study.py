@@ -78,6 +78,10 @@ def test_results_of_the_summary() -> None:
     assert Scalar("knockdown").of(told, []) == 0.3
     assert Scalar("critical_field").of(told, []) == -0.0034
     assert Scalar("critical_field").of({"limit_points": points[:1]}, []) is None
+    earlier = {"snaps": [{"time": 2.0, "overshoot": 0.0}]}  # of an earlier version
+    of_snaps = [Scalar(name).of(earlier, []) for name in ("snap_time", "snap_departure", "snap_jump")]
+    assert of_snaps == [2.0, None, None]
+    assert Scalar("snap_jump").of({"snaps": []}, []) is None
 
 
 @pytest.mark.parametrize(

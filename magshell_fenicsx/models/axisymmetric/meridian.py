@@ -236,7 +236,8 @@ def graded_vertices(
     end
         Value of the parameter at the outer edge.
     circles
-        Where the curvature jumps, rims of dimples: a vertex is put there, one for those that nearly meet.
+        Where the curvature jumps, rims of dimples: a vertex is put there, one for those that nearly
+        meet.
     h
         Thickness over R, or the smaller size of the cells on the axis.
     largest

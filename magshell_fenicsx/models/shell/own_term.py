@@ -347,7 +347,8 @@ class OwnTerm:
         ]
 
     def _refuse_coordinates(self) -> None:
-        """See that every density is the same in other coordinates of the surface; each cell has its own.
+        """See that every density is the same in other coordinates of the surface; each cell has its
+        own.
 
         Raises
         ------

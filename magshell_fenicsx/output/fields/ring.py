@@ -14,7 +14,10 @@ from magshell_fenicsx.output.fields.tessellation import Numbers, Tessellation, t
 
 Array = NDArray[np.float64]
 FLAT = 0.02  # height over R below which a surface has no rings
-ASIDE = (1e-6, 0.01)  # over R: how far below the top, or above the bottom, a ring is cut; the latter at uneven rims
+ASIDE = (
+    1e-6,
+    0.01,
+)  # over R: how far below the top, or above the bottom, a ring is cut; the latter at uneven rims
 SAME_PLACE = 1e-9  # over R: distance of ends of pieces of the ring that are one
 GAP = np.pi / 4  # largest gap of a ring that is closed
 MOST_WAVES = 80
@@ -85,8 +88,8 @@ def waves_around(surface: Surface) -> Waves | None:
 
     Returns
     -------
-    None if no single number of at least two waves dominates, if the surface is flat, or if the ring is not closed
-    around e3.
+    None if no single number of at least two waves dominates, if the surface is flat, or if the ring
+    is not closed around e3.
     """
     height = surface.r0[:, 2]
     if np.ptp(height) < FLAT:

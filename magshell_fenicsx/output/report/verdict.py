@@ -216,8 +216,8 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 
 def _snaps(summary: Summary) -> list[Markup]:
-    """How long the first snap takes from a tenth to nine tenths of its way, after its departure from the fold, and how
-    far beyond its end it goes."""
+    """How long the first snap takes from a tenth to nine tenths of its way, after its departure
+    from the fold, and how far beyond its end it goes."""
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
         return []

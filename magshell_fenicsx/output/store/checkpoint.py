@@ -1,4 +1,5 @@
-"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the next is computed.
+"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the
+next is computed.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through adios4dolfinx 0.9.3)
 raises on one rank in `Close` then, and the other ranks wait for ever.
@@ -113,6 +114,12 @@ class Ordering:
                 "--resume"
             )
         return np.asarray(number)
+
+    @property
+    def is_present(self) -> bool:
+        """Whether the order in use is the present one: each rank has the nodes that it had in the
+        file's run."""
+        return np.array_equal(np.concatenate(self._parts), np.arange(len(self.places)))
 
     def gather(self, u: Vector) -> Array:
         """All values (n, components) of a displacement on rank 0 of its space; empty on other ranks."""
@@ -291,13 +298,26 @@ class Checkpoint:
         return found
 
     def _read(self, content: bytes) -> Finding:
-        """A finding, with this rank's part of its vector if the ranks had as many values each."""
+        """Return a finding, with this rank's part of its vector if the ranks have the nodes that
+        they had."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
+        self._refuse_other_kind(is_other="values" not in decoded)
         parts, rank = decoded["parts"], self._comm.rank
-        if len(parts) != self._comm.size:
+        if len(parts) != self._comm.size or not self._ordering.is_present:
             return Finding(decoded["values"])
         return Finding(decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank])
+
+    def _refuse_other_kind(self, *, is_other: bool) -> None:
+        """See that the file has a result where a result is wanted, and a finding where one is.
+
+        Raises
+        ------
+        Damaged
+            If it is the other: the history has gone another way than that of the file.
+        """
+        if is_other:
+            raise Damaged(f"{self._file}: is damaged: its results are in another order than this run's")
 
     def record(self, result: Point | str) -> None:
         """Put a result on disk."""
@@ -335,6 +355,7 @@ class Checkpoint:
     def _decoded(self, content: bytes) -> Point | str:
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
+        self._refuse_other_kind(is_other="values" in decoded)
         if "failure" in decoded:
             return str(decoded["failure"])
         u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))

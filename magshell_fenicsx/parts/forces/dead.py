@@ -183,7 +183,8 @@ class DeadSection(PathStep):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def warning(self, step: ProgrammeStep) -> str | None:
-        """A pressure by formula keeps its direction, where that of a fluid would turn with the surface."""
+        """A pressure by formula keeps its direction, where that of a fluid would turn with the
+        surface."""
         varying = next((i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None)
         if varying is None:
             return None

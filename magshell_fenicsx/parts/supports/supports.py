@@ -30,7 +30,7 @@ BESIDE = 1e-3  # largest distance from its plane at which curved elements leave 
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 NOT_HELD = "boundary: the shell is not held: it is free to "
-LOOSE = 1e-13  # of a rigid motion's energy, over that of the same displacements with all signs adding up: rounding
+LOOSE = 1e-13  # of a rigid motion's energy, over the sum of magnitudes that it is made of: rounding
 
 
 def held_on(
@@ -255,7 +255,7 @@ def unresisted(rigid: Array, held: Callable[[Vector], Vector], tangent: Callable
         displacement.array[:] = motion
         K.mult(displacement, product)
         energies.append(comm.allreduce(free @ product.array))
-    # what rounding leaves of an energy is a part of this, however stiff other shells of the same tangent are
+    # what rounding leaves of an energy is a part of this, however stiff other shells are
     bounds = comm.allreduce((free * _sums_of_rows(K)) @ free.T)
     to_unit_bounds = np.linalg.inv(np.linalg.cholesky(bounds))
     values, vectors = np.linalg.eigh(to_unit_bounds @ np.array(energies) @ to_unit_bounds.T)

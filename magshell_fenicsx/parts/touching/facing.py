@@ -79,7 +79,7 @@ class Facing:
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._undeformed = np.column_stack([r0, self.half])
         self._known: tuple[Points, Array] = rule, self.x_of(rule, self._undeformed)
-        self._mine = np.unique(rule.cell)  # the cells of this rank that are modelled
+        self._own_cells = np.unique(rule.cell)  # the cells of this rank that are modelled
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def placed(self, u: Array, *, faces: bool = True) -> Array:
@@ -99,7 +99,7 @@ class Facing:
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
         far = self._thickest
-        near = self._fit(*near_pairs(centres, radii, far, self._mine), far, self._r0 + u, self._r0 + v)
+        near = self._fit(*near_pairs(centres, radii, far, self._own_cells), far, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -153,7 +153,7 @@ class Facing:
                 return pairs
         centres, radii = self._spheres(self._r0 + u)
         margin = reach + MARGIN * float(radii.mean())
-        pairs = self._fit(*near_pairs(centres, radii, margin, self._mine), margin, self._r0 + u)
+        pairs = self._fit(*near_pairs(centres, radii, margin, self._own_cells), margin, self._r0 + u)
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
@@ -174,13 +174,15 @@ class Facing:
     def found(
         self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True, least: bool = False
     ) -> Places:
-        """The places that points, those of the rule if none are given, face at a displacement, within a distance of
-        faces or mid-surfaces; with `least` those of each point's least distance, and some others."""
+        """The places that points, those of the rule if none are given, face at a displacement,
+        within a distance of faces or mid-surfaces; with `least` those of each point's least
+        distance, and some others."""
         points = points or self._rule
         return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach, least=least))
 
-    def least(self, u: Array, far: float, points: Points | None = None) -> float:
-        """The least distance of any point at a displacement; `far` if none is nearer. Collective."""
+    def least_distance(self, u: Array, far: float, points: Points | None = None) -> float:
+        """The least distance of any point at a displacement; `far` if none is nearer.
+        Collective."""
         for reach in (*(part * far for part in NEARER_FIRST), far):
             mine = float(self.found(u, reach, points, least=True).distance.min(initial=far))
             nearest = float(self._comm.allreduce(mine, MPI.MIN))
@@ -189,11 +191,12 @@ class Facing:
         return far
 
     @cached_property
-    def _apart(self) -> tuple[Longs, Inside]:
-        """The connected surface (n,) of each cell, and whether places of one face all of another one, (m, m).
+    def _separate_surfaces(self) -> tuple[Longs, Inside]:
+        """The connected surface (n,) of each cell, and whether places of one face all of another
+        one, (m, m).
 
-        Of another surface each point's nearest place counts: it goes on from there to none that is nearer, and no place
-        of it is near the point in the point's own surface.
+        Of another surface each point's nearest place counts: it goes on from there to none that is
+        nearer, and no place of it is near the point in the point's own surface.
         """
         cell, side = np.nonzero(self._cells.across >= 0)
         n, beyond = len(self._cells.nodes), self._cells.across[cell, side]
@@ -209,14 +212,15 @@ class Facing:
         return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
 
     def _limits(self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float) -> Limits:
-        """How far the nearest place of a surface that is apart is at most: its nearest node within `most` is one.
+        """How far the nearest place of a surface that is apart is at most: its nearest node within
+        `most` is one.
 
         Parameters
         ----------
         asked, cell
             (m,) of the points x, and their cells.
         """
-        number, apart = self._apart
+        number, apart = self._separate_surfaces
         more = r[:, 3][self._cells.nodes] if r.shape[1] > 3 else np.zeros((1, 1))
         varies = highest(more, self._cells.lebesgue) + highest(-more, self._cells.lebesgue)
         reach, surface = np.full(len(x), np.inf), number[cell]
@@ -230,7 +234,8 @@ class Facing:
         return Limits(apart[number[pairs[0]], number[pairs[1]]], reach)
 
     def places_in(self, points: Points, u: Array, r: Array, reach: float, *, least: bool = False) -> Places:
-        """The places of all cells nearest to points, within a distance at a displacement; r as of `placed`."""
+        """The places of all cells nearest to points, within a distance at a displacement; r as of
+        `placed`."""
         thicker = highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
         of_faces, reach = reach, reach + 2 * thicker
         i, j = self._near_cells(u, reach)

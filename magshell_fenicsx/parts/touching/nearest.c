@@ -151,13 +151,14 @@ typedef struct {
 } Cells;
 
 /* The places nearest to points x (.., 4) that are nearer than `within`: of each pair of a cell with points order[first] to
-   order[first + number - 1], near them by less than a `reach` of mid-surfaces, which in `bounded` pairs is at most the limit
-   of each point. Where cells are near in the surface, places
-   count that are below their points and farther than `apart` mean thicknesses from x0 undeformed, of which the last
-   components, of points with the other sign, are half. Their number is returned. */
+   order[first + number - 1], near them by less than a `reach` of mid-surfaces, which in pairs that `is_bounded` is at
+   most the limit of each point. Where cells are near in the surface, places count that are below their points and
+   farther than `apart` mean thicknesses from x0 undeformed, of which the last components, of points with the other
+   sign, are half. Their number is returned. */
 FAST int64_t nearest(const Cells *all, int64_t pairs, const int64_t *cell, const int64_t *first, const int64_t *number,
-                     const uint8_t *near, const uint8_t *bounded, const double *limits, const int64_t *order,
-                     const double *x, const double *x0, double reach_of_all, double within, double apart, int64_t *point, int64_t *pair, double *X, double *free,
+                     const uint8_t *near, const uint8_t *is_bounded, const double *limits,
+                     const int64_t *order, const double *x, const double *x0, double reach_of_all,
+                     double within, double apart, int64_t *point, int64_t *pair, double *X, double *free,
                      double *distance, double *way, uint8_t *above)
 {
     const int degree = (int)all->degree;
@@ -167,7 +168,7 @@ FAST int64_t nearest(const Cells *all, int64_t pairs, const int64_t *cell, const
         const double *bounds = all->bounds + BOUNDS * cell[p];
         const v *of = (const v *)all->of + k * cell[p], *undeformed = (const v *)all->undeformed + k * cell[p];
         for (int64_t n = first[p]; n < first[p] + number[p]; ++n) {
-            const double reach = bounded[p] ? fmin(reach_of_all, limits[order[n]]) : reach_of_all;
+            const double reach = is_bounded[p] ? fmin(reach_of_all, limits[order[n]]) : reach_of_all;
             const double *at = x + 4 * order[n], away[3] = {at[0] - bounds[0], at[1] - bounds[1], at[2] - bounds[2]};
             const double far = reach + bounds[3];
             if (away[0] * away[0] + away[1] * away[1] + away[2] * away[2] >= far * far)

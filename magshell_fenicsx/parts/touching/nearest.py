@@ -232,13 +232,13 @@ class Limits:
 
     Attributes
     ----------
-    bounded
+    is_bounded
         (pairs,) whether places of these cells that are farther may be left out.
     reach
         (n,) of each point.
     """
 
-    bounded: NDArray[np.bool_]
+    is_bounded: NDArray[np.bool_]
     reach: Array
 
 
@@ -285,7 +285,7 @@ def places_near(
     nodal = r[cells.nodes[used]]
     nothing = np.zeros(len(cell), dtype=bool)
     flat, where = nodal[..., :3], undeformed or Undeformed(nothing, r, x, 0.0)
-    to = limits or Limits(nothing, np.zeros(len(x)))
+    limit = limits or Limits(nothing, np.zeros(len(x)))
     centres = flat.mean(axis=1)
     radii = BULGE * np.linalg.norm(flat - centres[:, None], axis=2).max(axis=1)
     bounds = np.column_stack([centres, radii, *(BETWEEN / parts * radii for parts in LATTICES)])
@@ -297,8 +297,8 @@ def places_near(
     most = int(number.sum())
     point, pair = np.empty((2, most), dtype=np.int64)
     made = point, pair, *(np.empty((most, *shape)) for shape in SHAPES), np.empty(most, dtype=bool)
-    of_pairs = which.ravel(), first, number, where.near, to.bounded
-    given = p(*of_pairs, to.reach, order, _padded(x), _padded(where.x))
+    of_pairs = which.ravel(), first, number, where.near, limit.is_bounded
+    given = p(*of_pairs, limit.reach, order, _padded(x), _padded(where.x))
     count = lib.nearest(every, len(cell), *given, reach, within, where.apart, *p(*made))
     X, free, distance, way = (each[:count] for each in made[2:6])
     point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
@@ -388,7 +388,8 @@ def determinant(A: Array) -> Array:
 
 
 def near_pairs(centres: Array, radii: Array, reach: float, own: Longs) -> tuple[Longs, Longs]:
-    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes of similar radii."""
+    """Pairs i != j of spheres that are nearer to each other than a reach, i among some, in classes
+    of similar radii."""
     size = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size == k) for k in np.unique(size)]
     owned = [own[size[own] == k] for k in np.unique(size)]

@@ -10,9 +10,10 @@ The cuts are those at an earlier state, whose number stands in a state as part o
 they are on their surface while a state is solved: energy, forces and tangent are exact derivatives of each other, and
 need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the cuts anew.
 
-Two curved surfaces touch in a zone that may be narrower than the distance of the points. Its force then sits on single
-points and goes along with their material, so that a mode which slides there seems to be unstable. For such states the
-triangles in the zone are divided, as often as the number of the cuts says: see `Cuts`.
+Two curved surfaces touch in a zone that may be narrower than the distance of the points. Its force
+then sits on single points and goes along with their material, so that a mode which slides there
+seems to be unstable. For such states the triangles in the zone are divided, as often as the number
+of the cuts says: see `Cuts`.
 """
 
 import hashlib
@@ -40,7 +41,7 @@ TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that ha
 NOBODY = -1  # the cell that a part of a cell faces where none is
 ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
 DIGITS = 6  # bytes of the hash of a displacement in the number of its cuts
-LEVELS = 16  # numbers of divisions that the number of cuts can tell apart: with the hash, a float has all digits
+LEVELS = 16  # more divisions the number of cuts cannot tell: a float has these and the hash exactly
 CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])  # in the reference triangle
 
 
@@ -118,7 +119,8 @@ class Triangles:
         return Triangles(*(getattr(self, each.name)[which] for each in fields(self)))
 
     def divided(self) -> "Triangles":
-        """Return the four halves of each: at the first corner, at both ends of the third side, and in the middle."""
+        """Return the four halves of each: at the first corner, at both ends of the third side, and
+        in the middle."""
         half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
         inside = np.full_like(self.ends, INSIDE)
         at_begin, at_end = (np.where(self.ends == INSIDE, INSIDE, self.ends & corner) for corner in (1, 2))
@@ -304,14 +306,15 @@ class Segments:
         one, other = one[order], other[order]
         pieces = cut_along(Pieces(one, other, self._projected(one, other, r)))
         points, triangles = [rule.of(~np.isin(rule.cell, one))], self._triangles(pieces)
-        for number in range(divisions):
-            closing = self._closing(triangles, gaps)
-            points += self._on(triangles.of(~closing), number)
-            triangles = triangles.of(closing).divided()
+        for times in range(divisions):
+            is_closing = self._closing(triangles, gaps)
+            points += self._on(triangles.of(~is_closing), times)
+            triangles = triangles.of(is_closing).divided()
         return Points.joined([*points, *self._on(triangles, divisions)])
 
     def _closing(self, triangles: Triangles, gaps: Callable[[Points], Array]) -> Inside:
-        """Whether the gap in triangles (n,) may be closed: it changes there by as much again as between some points."""
+        """Whether the gap in triangles (n,) may be closed: it changes there by as much again as
+        between some points."""
         X = CORNERS_AND_CENTROID
         gap = gaps(self._by_rule(triangles, X, np.ones(len(X)), 0)).reshape(-1, len(X))
         return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
@@ -366,9 +369,11 @@ class Segments:
 
 
 class Cuts:
-    """The points with the cuts of displacements, which have numbers; 0 is undeformed, without divisions.
+    """The points with the cuts of displacements, which have numbers; 0 is undeformed, without
+    divisions.
 
-    A number is `LEVELS` times a hash of the displacement, plus how often triangles in a zone of contact are divided.
+    A number is `LEVELS` times a hash of the displacement, plus how often triangles in a zone of
+    contact are divided.
 
     Parameters
     ----------

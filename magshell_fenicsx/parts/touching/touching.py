@@ -213,7 +213,7 @@ class Touching(ContactTerm):
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
         self._pressed()
-        least = self._facing.least(self._now(), self._far, self._points)
+        least = self._facing.least_distance(self._now(), self._far, self._points)
         return least - self._h if least < self._far else np.nan
 
     def penetration(self) -> float:
@@ -288,7 +288,7 @@ class Touching(ContactTerm):
 
     def gap(self, u: Array) -> float:
         """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
-        return self._facing.least(self._of_copies(u), self._far) - self._h
+        return self._facing.least_distance(self._of_copies(u), self._far) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
         """See `Facing.held_gap`."""
@@ -351,7 +351,8 @@ class Touching(ContactTerm):
         return self._cuts.numbered(u, self._divisions) if better else None
 
     def finer(self) -> float | None:
-        """The number of the present displacement with triangles in the zone of contact divided once more; collective.
+        """The number of the present displacement with triangles in the zone of contact divided once
+        more; collective.
 
         None if nothing touches, or if they are divided `MOST_DIVISIONS` times.
         """
@@ -376,12 +377,13 @@ class Touching(ContactTerm):
         return points, places.of(~self._facing.left_to_edges(points, places, normals))
 
     def recall(self, number: float) -> None:
-        """Let a number stand for the present displacement: it may be that of a run on other ranks; collective."""
+        """Let a number stand for the present displacement: it may be that of a run on other ranks;
+        collective."""
         self._cuts.recall(number, self._now())
 
     def _astray(self, points: Points, at: Places, turned: float = 0.0) -> float:
-        """The part of the force at points that do not face what they faced, on what is `turned`, or where triangles
-        are divided less often than in the zone of contact."""
+        """The part of the force at points that do not face what they faced, on what is `turned`, or
+        where triangles are divided less often than in the zone of contact."""
         elsewhere = points.faces[at.point] != at.cell
         other = at.of(elsewhere | (points.divisions[at.point] < self._divisions))
         whole, part = self._comm.allreduce(np.array([self._force(points, at), self._force(points, other) + turned]))

@@ -139,7 +139,8 @@ def test_potential_is_refused_where_it_is_none() -> None:
     [({"pressure": "1e-6*(1 + 0*z)"}, True), ({"pressure": 1e-6}, False), ({"per_area": [0, 0, "1e-6*x"]}, False)],
 )
 def test_warning_of_a_dead_pressure_by_formula(load_: dict[str, Any], warned: bool) -> None:
-    """A fluid's pressure turns with the surface: a long tube buckles at 3 D/R³ under it, at 4 D/R³ under a dead one."""
+    """A fluid's pressure turns with the surface: a long tube buckles at 3 D/R³ under it, at 4 D/R³
+    under a dead one."""
     case = load(
         CAP,
         {"at": "top", "force": [0, 0, -1e-6]},

@@ -355,7 +355,8 @@ ALONG = (lambda r0, u: ufl.dot(u.r1, u.r1), lambda r0, u: ufl.dot(u.r1, u.r1) + 
     ],
 )
 def test_cells_have_no_directions(density: Density | None, observed: dict[str, Density], on: str | None) -> None:
-    """r1 and r2 are along the sides of each cell: their lengths and directions are of the mesh, not of the shell."""
+    """r1 and r2 are along the sides of each cell: their lengths and directions are of the mesh, not
+    of the shell."""
     with pytest.raises(
         ValueError, match=rf"own{': seen' if observed else ''}: depends on the coordinates of r1 and r2"
     ):
@@ -363,7 +364,8 @@ def test_cells_have_no_directions(density: Density | None, observed: dict[str, D
 
 
 def test_invariant_densities_are_accepted() -> None:
-    """The surface's gradient, a bending energy that is observed, derivatives along an edge, one without a value."""
+    """The surface's gradient, a bending energy that is observed, derivatives along an edge, one
+    without a value."""
 
     def gradient(r0: Jet, u: Jet) -> Expr:
         up, along = kin.inverse_metric(r0), (u.r1, u.r2)
