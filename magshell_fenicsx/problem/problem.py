@@ -32,7 +32,7 @@ from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.names import refuse_unfit
-from magshell_fenicsx.problem.sizes import MeshSection, SolidSection, rubber_layer
+from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.turning import Span
 
@@ -368,16 +368,5 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         axis=pole,
         largest=min(0.2 * sqrt(h), span.largest),
         pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
-        layers=(_clamped_rubber(problem), rubber_layer(h)),
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
-
-
-def _clamped_rubber(problem: Problem) -> list[float]:
-    """The ends of the meridian at which rubber is clamped: it bends there in a layer as wide as it is thick."""
-    span = problem.meridian
-    assert span
-    if problem.material.rubber is None:
-        return []
-    ends = zip((0.0, span.length), (span.names[0], span.names[-1]), strict=True)
-    return [end for end, name in ends if name and problem.conditions.get(name) == "clamped"]

@@ -12,7 +12,6 @@ from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.grading import Feature, Grading, Line, Ring
 from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.rubber import Rubber
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.sections import MeshSurface
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Loaded = tuple[Array, Sequence[Step]]  # place in the chart, and the loads there
 SOLID_DEGREE = 2
-RUBBER_LAYER = 0.35, 0.0035  # of h, and of R at least: elements at a clamped edge of rubber at any refinement
-LAYER_GROWTH = 1.0  # of elements away from there: the shell beside the layer is smooth
 
 
 class MeshSection(Section):
@@ -119,7 +116,7 @@ def grading(
         return Grading([], size / mesh.refinement)
     fit = Fit(h, mesh.refinement, context.solid, local)
     growth = _growth(context, fit)
-    features = _rim(context, outline, fit) + _clamped_rubber(context, outline, fit)
+    features = _rim(context, outline, fit)
     features += [feature for each in shown for feature in each.features(outline, fit, growth)]
     for place, loads in loaded:
         for kind in {type(load): None for load in loads}:
@@ -154,28 +151,3 @@ def _rim(context: Context, outline: "Outline", fit: Fit) -> list[Feature]:
         return []
     size = max((step.load.rim(fit) for step in context.steps), default=1.4)
     return [Ring(outline.edge, size * sqrt(h) / fit.refinement, _growth(context, fit))]
-
-
-def rubber_layer(h: float) -> float:
-    """Return the size over R of elements at a clamped edge of rubber, h over R: see docs/theory.md, Rubber.
-
-    The layer changes loads by some h/R, so that elements of thin shells need not be as small as it is.
-    """
-    of_h, of_R = RUBBER_LAYER
-    return max(of_h * h, of_R)
-
-
-def _clamped_rubber(context: Context, outline: "Outline", fit: Fit) -> list[Feature]:
-    """Elements that show the layer in which stretched rubber bends at a clamped edge, about as wide as it is thick."""
-    boundary = context.of(BoundarySection)
-    held = boundary.conditions() if boundary else {}
-    if not Rubber.of(context) or "clamped" not in held.values():
-        return []
-    size = rubber_layer(fit.h)
-    if outline.disc:
-        return [Ring(outline.edge, size, LAYER_GROWTH)]
-    if not (grid := outline.grid):
-        return []
-    ends = ((axis, end[axis]) for axis in range(2) for end in (grid.low, grid.high))
-    sides = zip(ends, grid.sides, strict=True)
-    return [Line(axis, place, size, LAYER_GROWTH) for (axis, place), name in sides if held.get(name) == "clamped"]

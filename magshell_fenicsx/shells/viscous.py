@@ -347,7 +347,7 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
         edge = kin.inverse_metric(j), (nu1, nu2), 1
         given_moment += law(j, side).edge_moment(*given.strain(j, side), *edge) / 2
         bent += law(j, side).edge_moment(*_strained(j, v), *edge) / 2
-        stiff += law(j, side).edge_stiffness(*_strained(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
+        stiff += law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
     S_J, J = given.opened(carrier, across), across(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * carrier.dS()
@@ -355,7 +355,7 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
     nu1, nu2, stretch = kin.conormal(r0, m)
     edge = up, (nu1, nu2), 1
     M, bent = (own.edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
-    stiff = own.edge_stiffness(E, K, *edge) * model.sigma / carrier.widths[1]
+    stiff = own.edge_stiffness(E, *edge) * model.sigma / carrier.widths[1]
     for held_edge in factory.held:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
         S_J, J = given.opened(carrier, jump), jump(r0 + u)

@@ -226,7 +226,6 @@ def graded_vertices(
     axis: bool = True,
     largest: float = inf,
     pressed: tuple[float, float] | None = None,
-    layers: tuple[Sequence[float], float] = ((), 0.0),
     everywhere: float | None = None,
 ) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
@@ -244,8 +243,6 @@ def graded_vertices(
         Of the cells, whatever the thickness.
     pressed
         Cells of a size up to a distance from the start, where bodies press.
-    layers
-        Ends of the meridian where the shell bends in a layer, and the size of the cells there.
     everywhere
         The size of all cells, over the refinement, in place of all these.
 
@@ -268,8 +265,6 @@ def graded_vertices(
         sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
         if pressed:
             sizes = np.minimum(sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
-        for edge in layers[0]:
-            sizes = np.minimum(sizes, layers[1] + growth * np.abs(s - edge))
         return sizes
 
     lines = lines_of(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))

@@ -52,12 +52,12 @@ def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Form
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         edge = kin.inverse_metric(r0), (nu1, nu2), 1
-        return law.edge_moment(E, K, *edge), law.edge_stiffness(E, K, *edge)
+        return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
     raised = ufl.dot(natural.up, covector)
     edge = natural.up, (raised[0], raised[1]), ufl.dot(raised, covector)
     E, K, law = E - natural.strain, K - natural.bend, law.thicker(natural.thickness)
-    return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, K, *edge)
+    return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, *edge)
 
 
 def law_at(law: Law, r0: Jet) -> Law:

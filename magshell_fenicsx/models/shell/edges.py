@@ -138,16 +138,11 @@ def clamped(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0.
-
-    The penalty has the stiffness of small strains: that of rubber would fall with the stretch at the edge alone, and
-    let it turn there.
-    """
+    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
     J = -ufl.dot((n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M, _ = densities.normal_moment(r0, u, nu1, nu2, law, natural)
-    _, D = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
+    M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 
 

@@ -150,7 +150,7 @@ class Laminated(Law):
         frame = _Frame(self.direction, up)
         return _work(self._moment(frame, E, K), frame.twice(across))
 
-    def edge_stiffness(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         bent = _Frame(self.direction, up).twice(across)
         return self._of_D * _work(_stress(self.D, bent), bent)
 

@@ -128,7 +128,7 @@ class Law(ABC):
         """
 
     @abstractmethod
-    def edge_stiffness(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is proportional."""
 
 
@@ -163,7 +163,7 @@ class Koiter(Law):
         bent = K[..., 0, 0] * across[0] ** 2 + 2 * K[..., 0, 1] * across[0] * across[1] + K[..., 1, 1] * across[1] ** 2
         return self.bending_stiffness * ((1 - self.nu) * bent + self.nu * square * trace(K, up))
 
-    def edge_stiffness(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         return self.bending_stiffness * square**2
 
     def _square(self, S: Tensor, up: Tensor) -> Scalar:
@@ -256,8 +256,8 @@ class OfShells(Law):
     def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         return self._there([law.edge_moment(E, K, up, across, square) for law in self.laws])
 
-    def edge_stiffness(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        return self._there([law.edge_stiffness(E, K, up, across, square) for law in self.laws])
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        return self._there([law.edge_stiffness(E, up, across, square) for law in self.laws])
 
     def _each(self, change: Callable[[Law], Law]) -> Self:
         return replace(self, laws=tuple(change(law) for law in self.laws))

@@ -9,25 +9,15 @@ A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that
     h^2/(24 d) K : W''(E) : K.
 
 Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see docs/theory.md, Rubber.
-
-Where a stretched shell bends sharply, as at a clamped rim, that is too little: h a^ij K_ij is then no small number, and
-a hinge would cost nothing. What multiplies (a^ij K_ij)^2 therefore grows as the integral of 1/det C through the
-thickness does, whose inner face is closed up at the bend x = h d^(-1/2) a^ij K_ij = 1: see `Sharpening`.
 """
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from math import factorial
 
-import numpy as np
 import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered, trace
-
-LAYERS = 6  # Gauss's points through the thickness for a sharp bend
-ORDERS = 6  # derivatives of what goes on beyond the sharpest bend, so that energies of edges are smooth there
-SHARPEST = 0.9  # x^2 of the sharpest bend that is integrated: at 1 the inner face is closed up
 
 
 class Incompressible(Law):
@@ -55,14 +45,12 @@ class Incompressible(Law):
         of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
         T, tau = at.deformed_trace(K), trace(K, up)
-        of_square = of_square * self._sharpening(at, T).of_energy
         return (of_square * T**2 - of_mixed * T * tau - of_det * det + of_drawn * tau**2) / 2
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
         T, tau = at.deformed_trace(K), trace(K, up)
         a, adjugate = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]), (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
-        of_square = of_square * self._sharpening(at, T).of_moment
         by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
         M11, M12, M22 = (
             by_T * raised + by_tau * once - of_det / 2 * turned
@@ -74,16 +62,11 @@ class Incompressible(Law):
         M, (c1, c2) = self.moment(E, K, up), lowered(across, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
-    def edge_stiffness(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
         of_square, of_mixed, _, of_drawn = self._stiffness(at := Stretched(E, up))  # c c has no determinant
-        of_square = of_square * self._sharpening(at, at.deformed_trace(K)).of_stiffness
         (c1, c2), (a11, a12, a22) = lowered(across, up), at.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return of_square * T**2 - of_mixed * T * square + of_drawn * square**2
-
-    def _sharpening(self, at: "Stretched", T: Scalar) -> "Sharpening":
-        """Return the factors at a bend with the deformed trace T = a^ij K_ij."""
-        return Sharpening((self.t * self.h * T) ** 2 / at.d)
 
     @abstractmethod
     def _slopes(self, at: "Stretched") -> tuple[Scalar, Scalar]:
@@ -150,53 +133,6 @@ class Stretched:
     def deformed_trace(self, K: Tensor) -> Scalar:
         a11, a12, a22 = self.inverse
         return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
-
-
-class Sharpening:
-    """Factors by which a sharp bend x counts more than the square of x.
-
-    The mean of 1/(1 + 2 x z/h) over -h/2 < z < h/2 is artanh(x)/x = 1 + G x^2/3, G = 1 + 3 x^2/5 + 3 x^4/7 + ...
-    It is integrated by Gauss's rule as far as `SHARPEST`; beyond, G is a polynomial in x^2.
-
-    Parameters
-    ----------
-    y
-        x^2.
-
-    Attributes
-    ----------
-    of_energy, of_moment, of_stiffness
-        Of x^2/2, which becomes G x^2/2, and of its first and second derivative by x.
-    """
-
-    def __init__(self, y: Scalar) -> None:
-        rest = _positive(y - SHARPEST)
-        series = [_mean_through_thickness(y - rest, order) for order in range(ORDERS)]
-        G, G1, G2 = (_taylor(series[order:], rest) for order in range(3))
-        self.of_energy = G
-        self.of_moment = G + y * G1
-        self.of_stiffness = G + y * (5 * G1 + 2 * y * G2)
-
-
-def _taylor(derivatives: list[Scalar], step: Scalar) -> Scalar:
-    """Return the value of a polynomial, of its derivatives of order 0, 1, ... at a place that is `step` before."""
-    value = derivatives[-1]
-    for order in reversed(range(1, len(derivatives))):
-        value = derivatives[order - 1] + value * step / order
-    return value
-
-
-def _mean_through_thickness(y: Scalar, order: int) -> Scalar:
-    """Return a derivative by y = x^2 of G = 3 (artanh(x)/x - 1)/x^2."""
-    nodes, weights = np.polynomial.legendre.leggauss(LAYERS)
-    above = [(float(z) ** 2, float(w)) for z, w in zip(nodes, weights, strict=True) if z > 0]
-    terms = [3 * w * z2 * (z2 / (1 - z2 * y)) ** order / (1 - z2 * y) for z2, w in above]
-    return factorial(order) * sum(terms[1:], terms[0])
-
-
-def _positive(x: Scalar) -> Scalar:
-    """Return x where it is positive, 0 elsewhere."""
-    return ufl.conditional(ufl.gt(x, 0), x, 0) if isinstance(x, Expr) else np.where(np.real(x) > 0, x, 0 * x)
 
 
 def root(x: Scalar) -> Scalar:
