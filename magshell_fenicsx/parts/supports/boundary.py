@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ValidationError
 
 from magshell_fenicsx.input.section import Section
@@ -17,6 +18,8 @@ from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, nothing, tilted
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
+Array = NDArray[np.float64]
+THIN_RUBBER = 200  # R/h beyond which a clamped edge counts less than the mesh
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
 EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
@@ -62,6 +65,21 @@ class BoundarySection(Section, Ability):
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
         """Name -> condition."""
         return dict(self.__pydantic_extra__ or {})
+
+    def warning(self, context: Context, places: Array) -> str | None:
+        """Say that no shell theory holds where a pressure stretches thick rubber beside a clamped
+        edge."""
+        clamped = [name for name, condition in self.conditions().items() if condition == "clamped"]
+        blown_up = any(step.kind == "pressure" for step in context.steps)
+        is_rubber = getattr(context.shell, "rubber", None) is not None
+        if not (clamped and blown_up and is_rubber) or context.shell.R_over_h > THIN_RUBBER:
+            return None
+        return (
+            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as it is "
+            "thick, in which no shell theory holds: its fold may come too low, by up to a fourth, and "
+            "modes at the edge are none of the shell; hinged is right, and a clamped edge raises the "
+            "fold by less than h/R"
+        )
 
     def refuse_unfit(self, context: Context) -> None:
         """See that the names of points are free, and that a geometry has the edges that are named."""
