@@ -72,12 +72,6 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     raise Stopped(f"no equilibrium found at the first contact: {reason}")
 
 
-def stiffer(stage: Stage, high: Point) -> dict[str, float]:
-    """The settings of stiffer bodies where they penetrate too much at a point of a step; of a given
-    stiffness none."""
-    return stiffnesses(stage.scene, stage.leave(high.state))
-
-
 def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
     """The settings of what penetrates too much at a state, `STIFFER` times as stiff; of a given stiffness none."""
     h, raised = scene.problem.material.h, dict[str, float]()
@@ -103,12 +97,6 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
     while k < wanted:
         k *= STIFFER
     return k
-
-
-def recut(stage: Stage, high: Point) -> dict[str, float]:
-    """The numbers of cuts of shells along each other's cells at a point of a step, if they are much
-    better there."""
-    return better_cuts(stage.scene, stage.leave(high.state))
 
 
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:

@@ -18,15 +18,15 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import (
+    better_cuts,
     closer_points,
     of_its_own,
     passes,
     recall_cuts,
-    recut,
     refuse_crossing,
     refuse_passing,
     refuse_return,
-    stiffer,
+    stiffnesses,
 )
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
@@ -110,7 +110,7 @@ class _Checks:
         """
         if low.s != self._begin[0]:
             self._begin = low.s, low.negative_pivots
-        found = self._path.noted(partial(self._found, low, high)).values
+        found = self._path.noted(partial(self._finding, low, high)).values
         if "too_long" in found:
             raise StepTooLong(found["too_long"])
         if "stopped" in found:
@@ -121,7 +121,7 @@ class _Checks:
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
-    def _found(self, low: Point, high: Point) -> Finding:
+    def _finding(self, low: Point, high: Point) -> Finding:
         """Find out why the second of two points is refused, or which amplitudes change before it is
         solved again."""
         stage = self._stage
@@ -134,9 +134,10 @@ class _Checks:
             return Finding({"too_long": str(e)})
         except PathStopped as e:
             return Finding({"stopped": str(e), "at_high": e.point is high, "final": e.final})
-        raised = stiffer(stage, high)
+        state = stage.leave(high.state)
+        raised = stiffnesses(stage.scene, state)
         anew = not raised and low.s != self._cut_at  # slid points are better than none
-        cuts = recut(stage, high) if anew else {}
+        cuts = better_cuts(stage.scene, state) if anew else {}
         turned = high.turned_from(low) or low.negative_pivots != self._begin[1]
         closer = closer_points(stage, low, high) if turned and not (raised or cuts) else {}
         return Finding({"stiffer": raised, "cuts": cuts or closer})
