@@ -6,6 +6,7 @@ CORE_TYPE = $(if $(OPENBLAS_CORETYPE),$(ENV) .ci/core-type $(OPENBLAS_CORETYPE))
 
 LIMITED = $(if $(LIMIT),timeout --signal=INT --kill-after=30 $(LIMIT))
 MARK ?= not slow
+TESTS ?= tests
 
 CAMPAIGN := sh -c 'PYTHONPATH=cases:$$PYTHONPATH exec python3 -m "$$@"' campaign
 
@@ -19,10 +20,11 @@ make noise            every case under relative noise into docs/noise/: an hour 
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
 make studies          error against run time of two cases into docs/study/: 10 minutes
-make test             lint and all tests; with ROOT=sid the tests that are not marked slow, on Debian unstable
-                      (MARK=telling: those that tell most of another dolfinx, three minutes)
-make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
-                      (both: LIMIT=seconds; OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
+make test             lint and the tests that are not marked slow: 10 minutes on two cores
+                      (TESTS="tests/simulate ...": of these folders; MARK=slow, MARK=telling: those so marked;
+                      LIMIT=seconds; OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor;
+                      ROOT=sid: on Debian unstable, without lint)
+make test-all         lint and all tests
 make lint             ruff and mypy
 make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
@@ -31,7 +33,7 @@ make clean            remove caches and compiled kernels; keeps .env/root* and r
 endef
 export HELP
 
-.PHONY: help run check figures benchmarks extremes noise bench studies gallery site test fast lint image clean
+.PHONY: help run check figures benchmarks extremes noise bench studies gallery site test test-all lint image clean
 
 help:
 	@echo "$$HELP"
@@ -79,11 +81,10 @@ site:
 
 test: $(if $(ROOT),,lint)
 	$(CORE_TYPE)
-	$(ENV) $(LIMITED) $(PYTEST) $(if $(ROOT),-m '$(MARK)' tests/versions tests)
+	$(ENV) $(LIMITED) $(PYTEST) -m '$(MARK)' $(if $(ROOT),tests/versions) $(TESTS)
 
-fast: lint
-	$(CORE_TYPE)
-	$(ENV) $(LIMITED) $(PYTEST) -m 'not slow' $(TESTS)
+test-all: lint
+	$(ENV) $(LIMITED) $(PYTEST) $(TESTS)
 
 lint:
 	$(ENV) ruff check --exclude .env .

@@ -1,7 +1,8 @@
 """Small shells that several tests share."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
@@ -25,7 +26,8 @@ from magshell_fenicsx.shells.shell import ShellModel
 
 # ranks that wait for each other let others go on: beside another test they take a fifth of the time, and of the CPU
 os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
-CASES = Path(__file__).parents[1] / "cases"
+TESTS = Path(__file__).parent
+CASES = TESTS.parent / "cases"
 CAP = """
 shell:
   geometry: cap
@@ -51,6 +53,35 @@ mesh: {degree: 3, refinement: 0.5}
 loading: {kind: field, points: 4}
 """  # in units, bent by a field
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
+
+
+deselected_of_folder = Counter[str]()  # number of slow tests that are left out, by the folder of tests/
+
+
+def pytest_deselected(items: Sequence[pytest.Item]) -> None:
+    """Count the slow tests that are left out."""
+    slow_tests = (item for item in items if item.get_closest_marker("slow"))
+    deselected_of_folder.update(item.path.relative_to(TESTS).parts[0] for item in slow_tests)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Send the count from a worker to its controller, which collects nothing itself."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["deselected"] = dict(deselected_of_folder)
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_testnodedown(node: Any) -> None:
+    """Take the count of one worker: all collect the same tests. A worker that crashed has none."""
+    if not deselected_of_folder:
+        deselected_of_folder.update(getattr(node, "workeroutput", {}).get("deselected", {}))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say what `make test-all` has beyond the tests that were run."""
+    if deselected_of_folder:
+        counts = ", ".join(f"{count} of {folder}" for folder, count in deselected_of_folder.most_common())
+        terminalreporter.write_line(f"make test-all has {deselected_of_folder.total()} slow tests more: {counts}")
 
 
 @pytest.hookimpl(trylast=True)  # after tests that are not asked for have been left out
