@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
     from magshell_fenicsx.simulate.trace import trace
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Case",
     "CaseError",

@@ -150,5 +150,5 @@ _RUNNING = version_of(Path(__file__).parents[1])  # hashed at import: files may 
 
 
 def code_version() -> str:
-    """Version and hash of the running code, such as 0.1.0+3f2a9c1b2d3e4f50."""
+    """Version and hash of the running code, such as 0.2.0+3f2a9c1b2d3e4f50."""
     return _RUNNING
