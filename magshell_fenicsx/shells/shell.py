@@ -44,7 +44,15 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import beside, on_cells, on_each, openings
-from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
+from magshell_fenicsx.parts.supports.moved import (
+    Support,
+    SupportKind,
+    enclosed,
+    motions_of,
+    moving,
+    pressed_edges,
+    rotation_of,
+)
 from magshell_fenicsx.parts.supports.supports import (
     closing_point,
     held_at_vertex,
@@ -206,7 +214,7 @@ class ShellModel(Thin):
                 terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
                 on_edge = held_on(V, 1, midsurface.edges[name], components)
-                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", in_plane=True)
+                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", of_what="plane")
                 continue
             edge, turn = "", None
             if name in clamped:
@@ -224,7 +232,8 @@ class ShellModel(Thin):
             else:
                 conditions_of_part = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
             held += conditions_of_part
-            self.supports[name] = Support.of(conditions_of_part, edge, turn)
+            of_what: SupportKind = "point" if name in midsurface.points else "part"
+            self.supports[name] = Support.of(conditions_of_part, edge, turn, of_what=of_what)
         self.supports |= on_planes
         self.planes = tuple(planes)
         closing = closing_point(planes)

@@ -1,5 +1,8 @@
 """Reactions of supports: beams, an annular plate, and global equilibrium."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 from models.moving_scenes import CLAMPED, NONE, PLATE, RING, move, moving_scene
@@ -120,30 +123,43 @@ def test_half_and_whole() -> None:
     np.testing.assert_allclose(total, [0, 0, -100.0 * 0.1 / PLATE["youngs_modulus"]], atol=1e-15)  # type: ignore[operator]
 
 
+def hinged_plate(names: Sequence[str], **sections: Any) -> dict[str, Reaction]:
+    """The reactions of a square plate on hinges all around, under a pressure."""
+    plate = {
+        "geometry": "plate",
+        "length": 1,
+        "width": 1,
+        "thickness": 0.01,
+        "youngs_modulus": 1.0,
+        "poisson_ratio": 0.3,
+    }
+    pressure = {"kind": "dead", "loads": [{"over": "all", "pressure": 1e-9}], "factor": 0.001}
+    case = {
+        "shell": plate,
+        "boundary": dict.fromkeys(names, "hinged"),
+        "loading": pressure | {"control": "load", "points": 1},
+        "reactions": True,
+        "symmetry": "none",
+    }
+    boundary = case["boundary"] | sections.pop("boundary", {})  # type: ignore[operator]
+    scene = Scene(ms.Case.from_source(Source("test", case | {"boundary": boundary} | sections)))
+    *_, last = ms.follow(scene)
+    return found(scene, last.point.state)
+
+
 @pytest.mark.parametrize("order", [("bottom", "top", "left", "right"), ("left", "right", "bottom", "top")])
 def test_edges_that_meet_share_a_corner(order: tuple[str, ...]) -> None:
-    """A square plate, hinged all around, under a pressure: by symmetry a quarter on each edge, in any order."""
-    case = {
-        "shell": {
-            "geometry": "plate",
-            "length": 1,
-            "width": 1,
-            "thickness": 0.01,
-            "youngs_modulus": 1.0,
-            "poisson_ratio": 0.3,
-        },
-        "boundary": dict.fromkeys(order, "hinged"),
-        "loading": {
-            "kind": "dead",
-            "loads": [{"over": "all", "pressure": 1e-9}],
-            "factor": 0.001,
-            "control": "load",
-            "points": 1,
-        },
-        "reactions": True,
-        "mesh": {"size": 0.5, "degree": 3},
-    }
-    scene = Scene(ms.Case.from_source(Source("test", {**case, "symmetry": "none"})))
-    *_, last = ms.follow(scene)
-    forces = np.array([found(scene, last.point.state)[name].force[2] for name in order])
+    """By symmetry a quarter on each edge, in any order."""
+    of_edge = hinged_plate(order, mesh={"size": 0.5, "degree": 3})
+    forces = np.array([of_edge[name].force[2] for name in order])
     assert forces / forces.sum() == pytest.approx([0.25] * 4, rel=1e-6)
+
+
+def test_corner_force_of_a_hinged_plate() -> None:
+    """Timoshenko and Woinowsky-Krieger, table 8: 0.065 q a^2 holds each corner down, where a point takes it."""
+    corner = {"points": {"corner": [1, 1, 0]}, "boundary": {"corner": {"held": ["x", "y", "z"]}}}
+    named = hinged_plate(("bottom", "top", "left", "right"), mesh={"size": 0.125, "degree": 4}, **corner)
+    force = {name: reaction.force[2] for name, reaction in named.items()}
+    assert force["corner"] / sum(force.values()) == pytest.approx(-0.065, rel=1e-2)
+    assert force["left"] / sum(force.values()) == pytest.approx(0.25, rel=1e-6), "it has its corner forces still"
+    assert force["top"] == pytest.approx(force["right"], rel=1e-6)

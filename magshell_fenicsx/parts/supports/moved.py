@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from dolfinx import fem
@@ -12,6 +13,8 @@ from magshell_fenicsx.assembly.moving import Body, Curve, Lid, Moving, Pressed, 
 from magshell_fenicsx.parts.loads import Loads
 
 PRESSURE = "pressure"  # its amplitude
+SupportKind = Literal["point", "part", "plane"]
+PRECEDENCE: tuple[SupportKind, ...] = ("point", "part", "plane")
 
 
 @dataclass(frozen=True)
@@ -26,14 +29,15 @@ class Support:
         Name of the term that holds the normal of a clamped edge; "" without.
     turn
         The rotation in that term, if a motion turns the edge.
-    in_plane
-        Whether a mirror plane holds it, in the direction of its normal alone.
+    of_what
+        What holds: a point, a part (an edge or a patch), or a mirror plane, in the direction of its normal alone. Of
+        the supports that hold a component, those that come first in `PRECEDENCE` have its force.
     """
 
     dofs: NDArray[np.int32]
     edge: str = ""
     turn: fem.Constant | None = None
-    in_plane: bool = False
+    of_what: SupportKind = "part"
 
     @classmethod
     def of(
@@ -42,10 +46,10 @@ class Support:
         edge: str = "",
         turn: fem.Constant | None = None,
         *,
-        in_plane: bool = False,
+        of_what: SupportKind = "part",
     ) -> "Support":
         dofs = [bc.dof_indices()[0] for bc in held]
-        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, in_plane)
+        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, of_what)
 
 
 def motions_of(loads: Loads, name: str) -> Sequence[Motion]:

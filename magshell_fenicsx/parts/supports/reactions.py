@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.moving import in_space
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.parts.supports.moved import PRECEDENCE
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.observed import Observed
@@ -46,9 +47,9 @@ class Reaction:
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """The reactions of all supports in the model's frame; collective.
 
-    Supports that hold a node together share its force equally. A clamped edge also makes a couple:
-    its energy is invariant if shell and edge turn together, so the couple is minus the moment of that
-    energy's gradient.
+    A point has the force of its node; edges and patches that hold a node together share it equally. A clamped edge
+    also makes a couple: its energy is invariant if shell and edge turn together, so the couple is minus the moment of
+    that energy's gradient.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
 def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
     """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a way (3,).
 
-    As in `reactions`, of the whole shell, and supports that hold a node together share its force equally.
+    As in `reactions`, of the whole shell.
     """
     if mirror and name in mirror.lost:
         name, way = mirror.lost[name], mirror.reflection @ way
@@ -93,17 +94,22 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
 def _shares(model: "Observed") -> dict[str, Array]:
     """Return the share that each support has in the force at the owned unknowns.
 
-    Edges and points that hold an unknown share it equally. What they hold at a mirror plane is not the plane's.
+    A point has the force of its node alone, edges and patches share it equally, and a mirror plane has what is left.
     """
     size = model.system.size
-    held = {name: np.zeros(size) for name in model.supports}
-    for name, support in model.supports.items():
-        held[name][support.dofs[support.dofs < size]] = 1.0
-    planes = [name for name, support in model.supports.items() if support.in_plane]
-    supported = sum((each for name, each in held.items() if name not in planes), np.zeros(size))
-    for name in planes:
-        held[name][supported > 0] = 0.0
-    return {name: each / np.maximum(sum(held.values(), np.zeros(size)), 1.0) for name, each in held.items()}
+    shares = {name: np.zeros(size) for name in model.supports}
+    without_support = np.ones(size, dtype=bool)
+    for kind in PRECEDENCE:
+        names = [name for name, support in model.supports.items() if support.of_what == kind]
+        for name in names:
+            dofs = model.supports[name].dofs
+            shares[name][dofs[dofs < size]] = 1.0
+            shares[name] *= without_support
+        number = sum((shares[name] for name in names), np.zeros(size))
+        for name in names:
+            shares[name] /= np.maximum(number, 1.0)
+        without_support &= number == 0
+    return shares
 
 
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
