@@ -127,6 +127,7 @@ def test_tangent(symmetry: str) -> None:
     assert v @ along(15.0) > v @ along(0.0)
 
 
+@pytest.mark.slow
 def test_buckling_is_that_of_ones_own_energy() -> None:
     """The key of the case file and an `OwnTerm` with the same density."""
     case = ms.Case.load(CASES / "dimple_buckling.yaml", ["mesh.degree=3"])
@@ -214,7 +215,14 @@ def test_bar_on_springs_that_stiffen() -> None:
     assert found["foundation_tangential"] == pytest.approx(b**3)
 
 
-@pytest.mark.parametrize(("y", "r", "model"), [(0.0, 0.02, "shell"), (0.17, 0.004, "shell"), (0.17, 0.02, "solid")])
+@pytest.mark.parametrize(
+    ("y", "r", "model"),
+    [
+        (0.0, 0.02, "shell"),
+        pytest.param(0.17, 0.004, "shell", marks=pytest.mark.slow),
+        pytest.param(0.17, 0.02, "solid", marks=pytest.mark.slow),
+    ],
+)
 def test_narrow_springs(y: float, r: float, model: str) -> None:
     """Springs on a disc of radius r, and k everywhere: the energy of a unit of w is k (pi + A pi r²)/2.
 
