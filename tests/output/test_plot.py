@@ -88,6 +88,7 @@ def test_a_torn_row_is_no_point(run: Path, tmp_path: Path) -> None:
     assert "shell.png" in draw(again)
 
 
+@pytest.mark.slow
 def test_another_point(run: Path, tmp_path: Path) -> None:
     """The last one has the pixels of the run's own pictures, and the first has others."""
     again, last = copied(run, tmp_path, "*.png"), len(read_rows(run / "path.csv")) - 1

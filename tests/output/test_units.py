@@ -104,7 +104,9 @@ SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modu
             ["mesh={degree: 2}", "frequencies={at: end, count: 2}", "shell.density=1000 kg/m^3"],
             marks=pytest.mark.slow,
         ),
-        ("cylinder_waves", ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"]),
+        pytest.param(
+            "cylinder_waves", ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"], marks=pytest.mark.slow
+        ),
         ("gripper", ["mesh={degree: 2}"]),
         pytest.param("rod_contact", ["mesh={degree: 2, refinement: 0.4}"], marks=pytest.mark.slow),
         ("dimple_buckling", [f"shell={SPHERE % DIMPLE}", "symmetry=half", "mesh={degree: 2, refinement: 0.4}"]),

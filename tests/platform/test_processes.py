@@ -105,6 +105,7 @@ def a_folder(out: Path) -> None:
 ALONE = (what_rank_0_gets, any_error, files, what_cannot_be_sent, reads, meshes)
 
 
+@pytest.mark.slow
 def test_every_rank_gets_what_the_first_does(tmp_path: Path) -> None:
     """Where a rank would wait for ever, a timeout ends the test."""
     launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", "2", sys.executable]

@@ -92,6 +92,7 @@ def test_path_that_is_lost_before_an_instability_is_no_answer(monkeypatch: pytes
     assert (found.remarks, found.knockdown) == ([], None)
 
 
+@pytest.mark.slow
 def test_snap_of_a_shell_that_has_buckled_before() -> None:
     """A shallow cap has waves before its fold; the remark names the first of them, which the path has located."""
     load = {"kind": "pressure", "until": "limit", "then": "snap"}

@@ -108,7 +108,9 @@ def force(scene: Scene, h: float) -> Array:
     return np.asarray(found[upper].sum(axis=0) * 1e6 * h * MM * 5 * MM)
 
 
-@pytest.mark.parametrize(("gap", "size", "radius"), [(1, 1.2, 2.5), (3, 2.5, 5), (20, 2.5, 5)])
+@pytest.mark.parametrize(
+    ("gap", "size", "radius"), [(1, 1.2, 2.5), pytest.param(3, 2.5, 5, marks=pytest.mark.slow), (20, 2.5, 5)]
+)
 def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, size: float, radius: float) -> None:
     """Magpylib's field of one cylinder on the faces of the other, at gaps of 1, 3 and 20 h: 1e-3."""
     h = 0.2

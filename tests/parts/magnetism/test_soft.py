@@ -81,7 +81,7 @@ KINDS = {
         model="solid", mesh={"size": 0.015},
     ),
 }  # fmt: skip
-QUICK = ("uniform, turned", "half, thickness", "half, saturating, by formula, thickness", "solid, graded")
+QUICK = ("uniform, turned", "half, saturating, by formula, thickness", "solid, graded")
 
 
 @cache
