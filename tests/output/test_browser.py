@@ -102,7 +102,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Any:
 PANES = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().toJSON())"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["magnet", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "magnet")])
 def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, report: Any) -> None:
     """No error, nothing wider than the window; the shell in its true proportions, neither tiny nor cut off."""
     page.open(report(kind), 1200)
@@ -171,6 +171,7 @@ def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
     assert page.value("document.getElementById('step').value") == "0"
 
 
+@pytest.mark.slow
 def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report: Any, tmp_path: Path) -> None:
     """Two folds 1 % of the curve apart: an inset around them as in curve.png, and none far apart."""
     for gap, drawn in ((0.01, True), (0.5, False)):

@@ -106,6 +106,7 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
     assert not fields["couple"]["colours"]  # a length has plotly's own
 
 
+@pytest.mark.slow
 @needs_plotly
 def test_one_page_below_six_megabytes(folder: Path, tmp_path: Path) -> None:
     """Nothing is looked for elsewhere; large pictures are reduced to the page's width."""

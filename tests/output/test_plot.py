@@ -47,6 +47,7 @@ def pixels(file: Path) -> np.ndarray:
     return np.asarray(Image.open(file).convert("RGB"), dtype=int)
 
 
+@pytest.mark.slow
 @pytest.mark.telling
 def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) -> None:
     """Without summary, as a killed run is: the same files with the same pixels."""
@@ -87,6 +88,7 @@ def test_a_torn_row_is_no_point(run: Path, tmp_path: Path) -> None:
     assert "shell.png" in draw(again)
 
 
+@pytest.mark.slow
 def test_another_point(run: Path, tmp_path: Path) -> None:
     """The last one has the pixels of the run's own pictures, and the first has others."""
     again, last = copied(run, tmp_path, "*.png"), len(read_rows(run / "path.csv")) - 1
@@ -136,6 +138,7 @@ def test_frames_at_equal_times() -> None:
     assert len(in_true_time(rows[:11])) == 10
 
 
+@pytest.mark.slow
 def test_animation(run: Path, tmp_path: Path) -> None:
     """A frame for every point of the pressure's path; what does not move has the same pixels in all."""
     again = copied(run, tmp_path)

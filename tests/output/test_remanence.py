@@ -35,6 +35,7 @@ def test_the_field_tells_where_the_remanence_jumps() -> None:
     assert whole.fields["Ba"][3:] == pytest.approx(fields["Ba"])
 
 
+@pytest.mark.slow
 def test_a_remanence_without_a_field_is_drawn() -> None:
     """On the meridian and on a whole strip; there are no loads, and what the meridian cannot show is left out."""
     strip = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0}

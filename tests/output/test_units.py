@@ -99,18 +99,25 @@ SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modu
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
-        ("arch", ["mesh={degree: 2}", "frequencies={at: end, count: 2}", "shell.density=1000 kg/m^3"]),
-        ("cylinder_waves", ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"]),
+        pytest.param(
+            "arch",
+            ["mesh={degree: 2}", "frequencies={at: end, count: 2}", "shell.density=1000 kg/m^3"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "cylinder_waves", ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"], marks=pytest.mark.slow
+        ),
         ("gripper", ["mesh={degree: 2}"]),
-        ("rod_contact", ["mesh={degree: 2, refinement: 0.4}"]),
+        pytest.param("rod_contact", ["mesh={degree: 2, refinement: 0.4}"], marks=pytest.mark.slow),
         ("dimple_buckling", [f"shell={SPHERE % DIMPLE}", "symmetry=half", "mesh={degree: 2, refinement: 0.4}"]),
-        (
+        pytest.param(
             "dimple_buckling",
             [
                 f"shell={SPHERE % DIMPLE}",
                 *("mesh={degree: 3, refinement: 0.5}", "loading.sensitivities=true"),
                 "gradients={of: [buckling_pressure_Pa, knockdown], by: [shell.poisson_ratio, thickness]}",
             ],
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -81,7 +81,9 @@ def test_long_beam_under_a_force() -> None:
     assert softer["w_pole_over_h"] == pytest.approx(w, rel=1e-5)
 
 
-@pytest.mark.parametrize(("symmetry", "refinement", "tolerance"), [("half", 2, 2e-7), ("none", 1, 2e-5)])
+@pytest.mark.parametrize(
+    ("symmetry", "refinement", "tolerance"), [pytest.param("half", 2, 2e-7, marks=pytest.mark.slow), ("none", 1, 2e-5)]
+)
 def test_the_same_in_every_shell(symmetry: str, refinement: float, tolerance: float) -> None:
     """A clamped plate, on the meridian and on triangles; without a foundation it deflects 17 times as far."""
     sections = {"shell": DISC, "boundary": {"rim": "clamped"}, "loading": PRESSED, "foundation": {"stiffness": 1e-3}}
@@ -94,6 +96,7 @@ def test_the_same_in_every_shell(symmetry: str, refinement: float, tolerance: fl
     assert meridian["foundation"] == pytest.approx(1e-3 * 50)
 
 
+@pytest.mark.slow
 def test_under_a_solid() -> None:
     """On its outer face; it is more flexible than the shell by its shear, of order (h/R)^2."""
     sections = {"shell": DISC, "boundary": {"rim": "clamped"}, "loading": PRESSED, "foundation": {"stiffness": 1e-3}}
@@ -127,6 +130,7 @@ def test_tangent(symmetry: str) -> None:
     assert v @ along(15.0) > v @ along(0.0)
 
 
+@pytest.mark.slow
 def test_buckling_is_that_of_ones_own_energy() -> None:
     """The key of the case file and an `OwnTerm` with the same density."""
     case = ms.Case.load(CASES / "dimple_buckling.yaml", ["mesh.degree=3"])
@@ -214,7 +218,14 @@ def test_bar_on_springs_that_stiffen() -> None:
     assert found["foundation_tangential"] == pytest.approx(b**3)
 
 
-@pytest.mark.parametrize(("y", "r", "model"), [(0.0, 0.02, "shell"), (0.17, 0.004, "shell"), (0.17, 0.02, "solid")])
+@pytest.mark.parametrize(
+    ("y", "r", "model"),
+    [
+        (0.0, 0.02, "shell"),
+        pytest.param(0.17, 0.004, "shell", marks=pytest.mark.slow),
+        pytest.param(0.17, 0.02, "solid", marks=pytest.mark.slow),
+    ],
+)
 def test_narrow_springs(y: float, r: float, model: str) -> None:
     """Springs on a disc of radius r, and k everywhere: the energy of a unit of w is k (pi + A pi r²)/2.
 
@@ -245,7 +256,7 @@ def test_springs_of_negative_stiffness() -> None:
 FREE_DISC = {"shell": DISC, "boundary": {"rim": "free"}}
 
 
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "none"])
+@pytest.mark.parametrize("symmetry", ["axisymmetric", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_free_disc_on_springs(symmetry: str) -> None:
     """It is held by its springs alone, in equilibrium with a force: their reaction is the force."""
     force = {"kind": "indentation", "at": {"polar": 0}, "control": "load", "until": "target", "force": 1e-3}

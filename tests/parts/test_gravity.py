@@ -90,6 +90,7 @@ def test_greenhill() -> None:
     assert ended(case)["gravity"] == pytest.approx(9 / 4 * zero**2 / 12 * 0.01**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_fold_from_two_sides() -> None:
     """A heavy cap under pressure: the fold by the weight at p is the fold by the pressure at that weight."""
     pressed = {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.2, "points": 2}
@@ -157,7 +158,7 @@ def test_history() -> None:
     assert rows[-2:] == pytest.approx([2e-6, 3e-6])
 
 
-@pytest.mark.parametrize("factor", [None, "exp(0.6*x + 0.8*y)"])
+@pytest.mark.parametrize("factor", [None, pytest.param("exp(0.6*x + 0.8*y)", marks=pytest.mark.slow)])
 def test_a_half_beside_the_first_axis(factor: str | None) -> None:
     """Gravity across the axis of a disc chooses the plane of the half, also on a bed that varies in this plane."""
     sections: dict[str, Any] = {

@@ -27,7 +27,6 @@ STRIP = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.002, "yo
 SIDES = {"left": "clamped", "bottom": "symmetry", "top": "symmetry"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("load", ["pulled", "bent"])
 def test_coupled_strip(load: str) -> None:
     """[0/90] in cylindrical bending, by lamination theory: N = A11 e - B11 k, M = D11 k - B11 e."""

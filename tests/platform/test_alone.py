@@ -42,7 +42,7 @@ def done(mode: str, rank: int, *words: str | Path) -> subprocess.CompletedProces
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
 
-@pytest.mark.parametrize("mode", ["unreadable", "another"])
+@pytest.mark.parametrize("mode", ["unreadable", pytest.param("another", marks=pytest.mark.slow)])
 def test_rank_0_reads_for_all(tmp_path: Path, mode: str) -> None:
     """The case, its settings and its mesh file: the run is that of rank 0 alone."""
     ended = done(mode, 1, "run", CASES / "bracket.yaml", *QUICK, "--out", tmp_path)
@@ -50,7 +50,7 @@ def test_rank_0_reads_for_all(tmp_path: Path, mode: str) -> None:
     assert "The run reached its target" in ended.stdout
 
 
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_an_error_of_one_rank_ends_all(tmp_path: Path, rank: int) -> None:
     """With its message, the exit code of a user's error, and in seconds."""
     start = time.monotonic()

@@ -53,6 +53,7 @@ def test_volume_that_turns_just_behind_the_fold() -> None:
 PERFECT = in_units(60, "0.3 mm", mesh=MESH, loading={"kind": "pressure", "until": "limit"})
 
 
+@pytest.mark.slow
 def test_path_that_is_lost_beyond_the_first_instability(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same k_d as with until: bifurcation, exit code 0, the reason as a remark, and pictures of that point."""
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 9)
@@ -91,6 +92,7 @@ def test_path_that_is_lost_before_an_instability_is_no_answer(monkeypatch: pytes
     assert (found.remarks, found.knockdown) == ([], None)
 
 
+@pytest.mark.slow
 def test_snap_of_a_shell_that_has_buckled_before() -> None:
     """A shallow cap has waves before its fold; the remark names the first of them, which the path has located."""
     load = {"kind": "pressure", "until": "limit", "then": "snap"}
@@ -108,6 +110,7 @@ def test_snap_of_a_shell_that_has_buckled_before() -> None:
     assert f"({first.mode}) since pressure = {first.point.state.mu['pressure']:.6g} (" in remark
 
 
+@pytest.mark.slow
 def test_plate_on_a_deep_cap_snaps() -> None:
     """Where it snaps a finer mesh (refinement 2) has 5.40719 h; behind it the contact goes back the way it came."""
     loading = {"kind": "contact", "approach": "8 mm", "points": 10}
@@ -134,6 +137,7 @@ def test_line_of_a_fold_has_the_force_of_its_body() -> None:
     assert f"F {found.rows[-1]['force_plate_N']:9.5g} N" in fold
 
 
+@pytest.mark.slow
 def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
     """A field and a pressure on a dimple at the pole; the finer mesh is twice as fine."""
     shell = {"geometry": "hemisphere", "radius_to_thickness": 80, "poisson_ratio": 0.49}

@@ -109,6 +109,7 @@ def test_no_display_and_no_virtual_one(monkeypatch: pytest.MonkeyPatch) -> None:
         ms.off_screen()
 
 
+@pytest.mark.slow
 def test_frequencies_and_gradients_need_no_folder() -> None:
     """A clamped disc rings at 10.2158 sqrt(D/(rho h R^4)) (Leissa); its bending stiffness is that of h^3."""
     case = {

@@ -125,6 +125,7 @@ def force(one: Case) -> float:
     return float(result.rows[-1]["force"])
 
 
+@pytest.mark.slow
 def test_half_and_full_shells_push_back_alike() -> None:
     """On coarse meshes that differ; and with equal semi-axes as the meridian under a ball."""
     half, full = (force(case(symmetry)) for symmetry in ("half", "none"))

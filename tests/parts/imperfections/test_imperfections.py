@@ -108,7 +108,9 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
     assert inside > 30
 
 
-@pytest.mark.parametrize(("polar", "near"), [(15.0, 1e-5), (2 * np.degrees(PHI_O), 1e-3), (22.3, 1e-5)])
+@pytest.mark.parametrize(
+    ("polar", "near"), [(15.0, 1e-5), pytest.param(2 * np.degrees(PHI_O), 1e-3, marks=pytest.mark.slow), (22.3, 1e-5)]
+)
 def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None:
     """Where they touch, the mesh has them a little wider."""
     problem = make_problem(shaped("hemisphere", dimple(), towards(polar)))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from command import magshell, read_path
 from dolfinx import fem
-from interrupted import start, wait_for_rows
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 
@@ -109,7 +108,9 @@ def force(scene: Scene, h: float) -> Array:
     return np.asarray(found[upper].sum(axis=0) * 1e6 * h * MM * 5 * MM)
 
 
-@pytest.mark.parametrize(("gap", "size", "radius"), [(1, 1.2, 2.5), (3, 2.5, 5), (20, 2.5, 5)])
+@pytest.mark.parametrize(
+    ("gap", "size", "radius"), [(1, 1.2, 2.5), pytest.param(3, 2.5, 5, marks=pytest.mark.slow), (20, 2.5, 5)]
+)
 def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, size: float, radius: float) -> None:
     """Magpylib's field of one cylinder on the faces of the other, at gaps of 1, 3 and 20 h: 1e-3."""
     h = 0.2
@@ -125,7 +126,11 @@ def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, siz
 
 
 @pytest.mark.parametrize(
-    ("along", "gap"), [*((along, gap) for along in "xz" for gap in (1, 4, 20)), ("z", 0.2), ("z", 0.05)]
+    ("along", "gap"),
+    [
+        *((along, gap) for along in "xz" for gap in (1, 4, 20)),
+        *(pytest.param("z", gap, marks=pytest.mark.slow) for gap in (0.2, 0.05)),
+    ],
 )
 def test_force_between_parallel_strips(model: Any, tmp_path: Path, gap: float, along: str) -> None:
     """Magpylib's cuboid on the charged sides of the other, and close above it: 1e-3."""
@@ -233,6 +238,7 @@ def elastica(L: float, w: float, h: float, apart: float, E: float) -> Array:
     return np.array([found.y[0, -1] / MM - L, found.y[1, -1] / MM - apart])
 
 
+@pytest.mark.slow
 def test_strip_above_a_strip(model: Any, tmp_path: Path) -> None:
     """The elastica in the field of its neighbour, 1e-3; Newton's method is quadratic."""
     L, w, h, apart = 10.0, 2.0, 0.25, 1.5
@@ -276,27 +282,19 @@ mesh: {degree: 2}
 SAME = ("interaction", "w_over_h", "energy", "magnetic", "bending")
 
 
-def test_ranks_and_resume(model: Any, tmp_path: Path) -> None:
-    """The same path on 1, 2 and 3 ranks, and of a run that goes on from its second point."""
+@pytest.mark.slow
+def test_same_path_on_ranks(model: Any, tmp_path: Path) -> None:
+    """On 1 and 2 ranks; test_self_interaction.py has a run that goes on."""
     strips(tmp_path / "strips.msh", 4.0, 2.0, 1.5, 2.0)
     (tmp_path / "case.yaml").write_text(CASE)
-    run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
-    wait_for_rows(run, tmp_path / "again", 2)
-    run.terminate()
-    run.communicate()
-    done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / "again", "--resume", ranks=1)
-    assert done.returncode == 0, done.stderr
-    paths = [read_path(tmp_path / "again")]
-    for ranks in (1, 2, 3):
+    for ranks in (1, 2):
         done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / str(ranks), ranks=ranks)
         assert done.returncode == 0, done.stderr
-        paths.append(read_path(tmp_path / str(ranks)))
-    for other in paths[1:]:
-        assert [row["negative_pivots"] for row in other] == [row["negative_pivots"] for row in paths[0]]
-        for name in SAME:
-            first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
-            assert values == pytest.approx(first, rel=1e-7, abs=1e-14), name
-    assert paths[0][-1]["interaction"] == "1.0"
+    one, two = (read_path(tmp_path / ranks) for ranks in "12")
+    for name in ("negative_pivots", *SAME):
+        first, second = ([float(row[name]) for row in rows] for rows in (one, two))
+        assert second == pytest.approx(first, rel=1e-7, abs=1e-14), name
+    assert one[-1]["interaction"] == "1.0"
 
 
 def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
@@ -407,13 +405,10 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
     assert slope == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("interaction", "symmetry"),
-    [
-        ("others", "half"),
-        pytest.param("others", "none", marks=pytest.mark.slow),
-        pytest.param("all", "half", marks=pytest.mark.slow),
-    ],
+    [("others", "half"), ("others", "none"), ("all", "half")],
 )
 def test_derivatives_by_thickness_and_place(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interaction: str, symmetry: str
@@ -533,6 +528,7 @@ def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) ->
     assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
     """Energy and forces are quadratic in it: Euler's identity, 1e-9."""
     strips(tmp_path / "strips.msh", 4.0, 2.0, 0.33, 1.5)

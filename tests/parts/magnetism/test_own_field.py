@@ -245,6 +245,7 @@ KINDS = {
                                                    {"hall": {"position": [12 * MM, 1 * MM, 4 * MM]}}, symmetry="half",
                                                    model="solid", mesh={"refinement": 0.3}, loading={"kind": "field"}),
 }  # fmt: skip
+QUICK = ("full", "meridian, radial", "full, rubber")
 
 
 @cache
@@ -252,7 +253,7 @@ def scene(kind: str) -> Scene:
     return KINDS[kind]()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
 def test_slopes_of_a_reading(kind: str) -> None:
     """By the displacement and the amplitudes: central differences of the reading."""
     here = scene(kind)
@@ -276,7 +277,7 @@ def test_slopes_of_a_reading(kind: str) -> None:
         assert slope.by_mu.get("lambda_m", 0.0) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("law", ["deformation", "rotation"])
+@pytest.mark.parametrize("law", ["deformation", pytest.param("rotation", marks=pytest.mark.slow)])
 def test_gradient_by_a_remanence(law: str) -> None:
     """A strip that its field bends: the reading of two solved strips with other remanences, 1e-5; and by its angle."""
 
@@ -399,7 +400,10 @@ def test_moment_of_a_bent_strip(sections: dict[str, Any]) -> None:
     np.testing.assert_allclose(m, expected, atol=2e-6 * expected[2])  # the tip is one point of its edge
 
 
-def test_moment_of_what_is_induced() -> None:
+@pytest.mark.parametrize(
+    "sections", [{}, {"symmetry": "half"}, pytest.param({"model": "solid"}, marks=pytest.mark.slow)]
+)
+def test_moment_of_what_is_induced(sections: dict[str, Any]) -> None:
     """In a weak field, of a soft disc, chi/(1 + chi) B V/mu0, whether meridian, solid or half."""
     shell = {
         "geometry": "disc",
@@ -409,12 +413,11 @@ def test_moment_of_what_is_induced() -> None:
         "poisson_ratio": 0.3,
     }
     magnetic = {"susceptibility": 2, "applied": {"polar": 0, "flux_density": "1 mT"}}
-    for sections in ({}, {"model": "solid"}, {"symmetry": "half"}):
-        case = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "loading": {"kind": "field"}}
-        m, row = moment_and_tip(Case.model_validate(case | sections))
-        volume = np.pi * 400 * MM**2 * 1 * MM
-        np.testing.assert_allclose(m, [0, 0, 1e-3 * 2 / 3 * volume / (4e-7 * np.pi)], rtol=1e-4, atol=1e-9 * m[2])
-        assert m[2] == pytest.approx(row["induced_z"] * volume / (4e-7 * np.pi), rel=1e-4)
+    case = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "loading": {"kind": "field"}}
+    m, row = moment_and_tip(Case.model_validate(case | sections))
+    volume = np.pi * 400 * MM**2 * 1 * MM
+    np.testing.assert_allclose(m, [0, 0, 1e-3 * 2 / 3 * volume / (4e-7 * np.pi)], rtol=1e-4, atol=1e-9 * m[2])
+    assert m[2] == pytest.approx(row["induced_z"] * volume / (4e-7 * np.pi), rel=1e-4)
 
 
 @pytest.mark.parametrize(

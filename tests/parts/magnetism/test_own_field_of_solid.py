@@ -154,6 +154,7 @@ def test_a_bent_block_is_its_dipoles(magnetic: dict[str, Any], polarised: Any, a
     assert (error(readings(scene, state), expected) < allowed).all(), error(readings(scene, state), expected)
 
 
+@pytest.mark.slow
 def test_a_thin_strip_as_a_shell_and_as_a_solid() -> None:
     """Bent to 22 of 30 mm: 1e-3 on a fine mesh, which is by how much its tip is beside that of the shell."""
     shell = {**BLOCK, "radius": "30 mm", "width": 0.3, "thickness": "0.3 mm", "poisson_ratio": 0.0}
@@ -178,7 +179,7 @@ def solved(law: str, e: float, polar: float = 10.0) -> tuple[Scene, Any]:
     return scene, last
 
 
-@pytest.mark.parametrize("law", ["deformation", "rotation"])
+@pytest.mark.parametrize("law", ["deformation", pytest.param("rotation", marks=pytest.mark.slow)])
 def test_gradient_of_a_reading(law: str) -> None:
     """By the remanence and by an angle: differences of solved blocks, 1e-6."""
     scene, last = solved(law, 0.0)

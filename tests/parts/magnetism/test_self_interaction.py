@@ -1,12 +1,14 @@
 """A magnetised part in its own field: closed forms of prisms and spherical shells, differences, eigenvalues."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import gmsh
 import numpy as np
 import pytest
-from command import magshell, read_path
+from command import magshell, mpirun, read_path
 from interrupted import start, wait_for_rows
 from mpi4py import MPI
 from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
@@ -196,14 +198,61 @@ shell: {geometry: cap, radius: 25 mm, thickness: 1.2 mm, polar: 60, youngs_modul
 boundary: {rim: clamped}
 magnetic: {remanent: {polar: 0, flux_density: 150 mT}, interaction: all}
 loading: {kind: pressure, control: load, points: 2, pressure: 200 Pa, until: target}
-mesh: {degree: 2, size: 8 mm}
+mesh: {degree: 2, size: 12 mm}
 symmetry: half
 """
 
 
+FORESEEN = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from magshell_fenicsx import Case, Scene
+scene = Scene(Case.load(sys.argv[1]))
+system, mu = scene.model.system, {"interaction": 1.0, "pressure": 0.1}
+comm, r0 = MPI.COMM_WORLD, scene.model.r0.x.array[: system.size].reshape(-1, 3)
+x, y, _ = r0.T
+bend = np.column_stack([x * y**2, 0 * x, 0.5 - x**2])
+turn = np.column_stack([0.2 - y**2, y * x, x * y**2])
+states = [system.held(each.ravel()) for each in (0 * bend, 1e-2 * bend, 1.3e-2 * bend + 1e-3 * turn)]
+exact = [system.residual(u, mu) for u in states[:2]]
+system.tangent(states[1], mu, rough=True)
+foreseen = system.residual(states[2], mu, rough=True)
+exact.append(system.residual(states[2], mu))
+assert not np.array_equal(foreseen, exact[2])
+rows = [r0, *(each.reshape(-1, 3) for each in (*exact, foreseen))]
+whole = comm.gather(np.hstack(rows))
+if comm.rank == 0:
+    whole = np.concatenate(whole)
+    np.save(sys.argv[2], whole[np.lexsort(whole[:, :3].round(6).T)])
+"""
+
+
+@pytest.mark.slow
+def test_forces_are_foreseen_by_the_same_derivative_on_ranks(tmp_path: Path) -> None:
+    """D has the same blocks on 1 and 2 ranks, and so foresees the same forces, to its single precision.
+
+    How many iterations they save hangs at thresholds and is no evidence of it.
+    """
+    (tmp_path / "case.yaml").write_text(CAP)
+    found = []
+    for ranks in (1, 2):
+        words = [sys.executable, "-c", FORESEEN, str(tmp_path / "case.yaml"), str(tmp_path / f"{ranks}.npy")]
+        done = subprocess.run(mpirun(ranks) + words, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        found.append(np.load(tmp_path / f"{ranks}.npy"))
+    x, *exact, foreseen = np.split(found[0], 5, axis=1)
+    change = np.abs(foreseen - exact[1]).max()
+    assert np.abs(foreseen - exact[2]).max() < 0.1 * change
+    for other in found[1:]:
+        np.testing.assert_allclose(other[:, :3], x, atol=1e-9)
+        np.testing.assert_allclose(other[:, 3:12], np.hstack(exact), rtol=0, atol=1e-9 * change)
+        np.testing.assert_allclose(other[:, 12:], foreseen, rtol=0, atol=1e-6 * change)
+
+
 @pytest.mark.slow
 def test_ranks_and_resume(tmp_path: Path) -> None:
-    """A half in its own and its image's field: the same path on 1, 2 and 3 ranks, and of a run that goes on."""
+    """A half in its own and its image's field: the same path on 1 and 2 ranks, and of a run that goes on."""
     (tmp_path / "case.yaml").write_text(CAP)
     run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
     wait_for_rows(run, tmp_path / "again", 2)
@@ -212,7 +261,7 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
     done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again", "--resume", ranks=1)
     assert done.returncode == 0, done.stderr
     paths = [read_path(tmp_path / "again")]
-    for ranks in (1, 2, 3):
+    for ranks in (1, 2):
         done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / str(ranks), ranks=ranks)
         assert done.returncode == 0, done.stderr
         paths.append(read_path(tmp_path / str(ranks)))
@@ -221,8 +270,6 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
         for name in ("interaction", "p_over_pc", "w_over_h", "energy", "magnetic"):
             first, values = ([float(row[name]) for row in rows] for rows in (paths[0], other))
             assert values == pytest.approx(first, rel=1e-7, abs=1e-13), name
-    iterations = [[int(row["iterations"]) for row in rows] for rows in paths[1:]]
-    assert np.ptp(iterations, axis=0).max() <= 1, "forces are foreseen by the same D on any number of ranks"
 
 
 def smooth(x: Array, sign: float) -> Array:

@@ -81,6 +81,7 @@ KINDS = {
         model="solid", mesh={"size": 0.015},
     ),
 }  # fmt: skip
+QUICK = ("uniform, turned", "half, saturating, by formula, thickness", "solid, graded")
 
 
 @cache
@@ -100,7 +101,7 @@ def rough(kind: str) -> tuple[Any, np.ndarray, dict[str, float]]:
     return system, u, {name: 0.3 + 0.1 * i for i, name in enumerate(sorted(mu))}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
 def test_derivatives(kind: str) -> None:
     """Residual, tangent, load columns, conjugates and their derivatives by all amplitudes, by central differences."""
     system, u, mu = rough(kind)
@@ -154,7 +155,8 @@ def test_a_plate_in_a_tilted_field(model: str) -> None:
     np.testing.assert_allclose([row[f"induced_{axis}"] for axis in "xyz"], J, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("saturation", [None, pytest.param("10 mT", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("saturation", [None, "10 mT"])
 def test_models_agree(saturation: str | None) -> None:
     """A soft disc in a graded field along its axis: meridian, half and full, and the polarisation of each."""
     shell: dict[str, Any] = {"geometry": "disc", "radius_to_thickness": 40, "poisson_ratio": 0.3}
@@ -258,6 +260,7 @@ def saturated_tip(chi: float, J: float, B: float, slender: float, angle: float) 
     return float(x) - 1, float(z)
 
 
+@pytest.mark.slow
 def test_a_saturating_strip_is_an_elastica() -> None:
     """The tip in a field beyond saturation, of SciPy's elastica with the same law: 1e-4."""
     unit = np.sqrt(4e-7 * np.pi * 1e6)
@@ -317,6 +320,7 @@ def test_a_sphere_in_a_uniform_field(chi: float, R_over_h: float) -> None:
     assert row["induced_z"] == pytest.approx(exact, rel=chi / R_over_h)
 
 
+@pytest.mark.slow
 def test_critical_field_as_a_solid() -> None:
     """The body's strip of L/h = 20 buckles at the same field, but for what shear and thickness change: O((h/L)²)."""
     case = {
@@ -330,6 +334,7 @@ def test_critical_field_as_a_solid() -> None:
     assert found.limit_points[0]["value"] == pytest.approx(np.pi / 2 / 20 * np.sqrt(3 / 48), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_gradient_by_susceptibility() -> None:
     """The critical field B_c ~ sqrt((1 + chi)/chi²): d ln B_c/d chi in closed form; tip by differences of two runs."""
     case = {
