@@ -126,13 +126,14 @@ def test_reaction(tmp_path: Path) -> None:
     settings = ["boundary={root: clamped, tip: {held: [z]}}", "reactions=true", "magnetic.remanent.polar=75"]
     scene, along, step = Scene(Case.load(tmp_path / "strip.yaml", settings)), Direction(0), 2e-3
     last = solved(scene)
-    found = {of: gradient(scene, last, of=of, by=[*FIELDS, "lambda_m"]) for of in ("root_fz", "tip_fz")}
+    fields = ("thickness", "deviation")
+    found = {of: gradient(scene, last, of=of, by=[*fields, "lambda_m"]) for of in ("root_fz", "tip_fz")}
     states = {c: state_with(scene, last, "thickness", along, c * step) for c in (-2, -1, 1, 2)}
     for of, by in found.items():
         assert functional(scene, last.point.state, of).value == pytest.approx(scene.observe(last.point.state)[of])
         expected = by_difference({c: functional(*each, of).value for c, each in states.items()}.__getitem__, 1) / step
         assert directional(scene, by["thickness"], "thickness", along) == pytest.approx(expected, rel=1e-6), of
-    for name in FIELDS:
+    for name in fields:
         root, tip = (directional(scene, by[name], name, Direction(3)) for by in found.values())
         assert root == pytest.approx(-tip, rel=1e-6), name
     assert found["root_fz"]["lambda_m"] == pytest.approx(-found["tip_fz"]["lambda_m"], rel=1e-6)
