@@ -136,9 +136,10 @@ def exactly() -> Iterator[None]:
     PETSc.Options().delValue("snes_stol")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("exactly")
-@pytest.mark.parametrize("name", PRESSED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] * each.startswith("caps")) for each in PRESSED]
+)
 def test_pressed_halves_are_the_whole(name: str) -> None:
     """The half's equilibrium and its image are one of all shells on the mirrored mesh, with its forces: 1e-7."""
     across, size, data = PRESSED[name]
