@@ -46,24 +46,18 @@ def test_three_descriptions_of_a_dimpled_hemisphere(loading: dict[str, Any]) -> 
         assert [other["p_over_pc"], other["force"]] == pytest.approx([ends[0]["p_over_pc"], ends[0]["force"]], rel=1e-9)
 
 
-@pytest.mark.parametrize("symmetry", ["half", "none"])
-def test_a_cap_is_a_hemisphere(symmetry: str) -> None:
+def test_a_cap_is_a_hemisphere() -> None:
     """With a force that is not at the pole, on the same triangles."""
     loading = {"kind": "indentation", "at": {"polar": 40, "azimuth": 30}, "depth": 1, "points": 1}
     mesh = {"degree": 2, "refinement": 0.4}
-    a, b = (end(case(s, loading=loading, symmetry=symmetry, mesh=mesh))["force"] for s in ("hemisphere", "cap"))
+    a, b = (end(case(s, loading=loading, symmetry="none", mesh=mesh))["force"] for s in ("hemisphere", "cap"))
     assert a == pytest.approx(b, rel=1e-9)
 
 
-PLACES = {
-    "hemisphere": [sin(0.7) * cos(0.5), sin(0.7) * sin(0.5), cos(0.7)],
-    "cylinder": [cos(0.5), sin(0.5), 1.0],
-    "plate": [1.0, 0.5, 0.0],
-}
+PLACES = {"hemisphere": [sin(0.7) * cos(0.5), sin(0.7) * sin(0.5), cos(0.7)], "cylinder": [cos(0.5), sin(0.5), 1.0]}
 INWARDS = {
     "hemisphere": -np.array(PLACES["hemisphere"]),
     "cylinder": -np.array([cos(0.5), sin(0.5), 0]),
-    "plate": -np.eye(3)[2],
 }
 
 
@@ -185,10 +179,9 @@ def test_a_patch_that_the_mesh_does_not_see() -> None:
 ANNULUS = {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "thickness": H, "youngs_modulus": 1.0}
 
 
-@pytest.mark.parametrize("load", [{"force": [0, 1e-6, 1e-6]}, {"per_length": [1e-7, 1e-6, 1e-6]}])
-def test_half_of_a_ring_with_an_oblique_edge_load(load: dict[str, Any]) -> None:
+def test_half_of_a_ring_with_an_oblique_edge_load() -> None:
     """The mirror plane holds e3 and the force; the half bears half of it."""
-    loading = {"kind": "dead", "loads": [{"edge": "inner", **load}], "factor": 1, "points": 1}
+    loading = {"kind": "dead", "loads": [{"edge": "inner", "per_length": [1e-7, 1e-6, 1e-6]}], "factor": 1, "points": 1}
     data = {"boundary": {"outer": "clamped"}, "mesh": {"degree": 3, "size": 0.3}, "loading": loading}
     shell = {"poisson_ratio": NU, **ANNULUS}
     half, whole = (
@@ -209,15 +202,16 @@ def test_half_of_a_cylinder_dented_at_one_side() -> None:
     assert half["A_uy"] / half["A_ux"] == pytest.approx(np.tan(0.5), rel=1e-9)
 
 
-@pytest.mark.parametrize("load", [{"edge": "tip", "force": [0, 0, 1e-9]}, {"edge": "tip", "moment": 1e-8}])
-def test_half_of_a_solid_strip_under_dead_loads(load: dict[str, Any]) -> None:
+def test_half_of_a_solid_strip_under_a_moment() -> None:
     """As the whole: 1 % apart, on meshes that differ."""
+    load = {"edge": "tip", "moment": 1e-8}
     loading = {"kind": "dead", "loads": [load], "factor": 1, "points": 1, "control": "load"}
     sections = {"points": {"A": [1.0, 0.0, 0.0]}, "loading": loading, "mesh": {"size": 0.2}, "model": "solid"}
     half, whole = (end(case("strip", symmetry=s, **sections)) for s in ("half", "none"))
     assert half["A_uz"] == pytest.approx(whole["A_uz"], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_solid_hemisphere_dented_at_a_named_point() -> None:
     """A direction and the point that it meets are one place; the motion is reported in the frame of the case."""
     place, patch = (

@@ -75,7 +75,9 @@ def asked(name: str, symmetry: str) -> Case:
     return Case.from_source({"mesh": {"degree": 3, "size": 0.25}, "symmetry": symmetry, **HALVES[name][1]})
 
 
-@pytest.mark.parametrize("name", HALVES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] * (each == "tubes with one axis")) for each in HALVES]
+)
 def test_half_and_whole_agree(name: str) -> None:
     """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of that; 1e-8."""
     seen = []
@@ -135,7 +137,9 @@ def exactly() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("exactly")
-@pytest.mark.parametrize("name", PRESSED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] * each.startswith("caps")) for each in PRESSED]
+)
 def test_pressed_halves_are_the_whole(name: str) -> None:
     """The half's equilibrium and its image are one of all shells on the mirrored mesh, with its forces: 1e-7."""
     across, size, data = PRESSED[name]

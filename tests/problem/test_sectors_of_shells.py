@@ -80,7 +80,7 @@ def symmetric(scene: Scene, size: float) -> np.ndarray:
     return np.asarray(model.system.held(u.ravel()))
 
 
-@pytest.mark.parametrize("name", ["rings", "gripper", "joined"])
+@pytest.mark.parametrize("name", ["rings", pytest.param("gripper", marks=pytest.mark.slow), "joined"])
 def test_copies_make_the_half(name: str) -> None:
     """Energy, contact force and residual of the half at the copies of a displacement: those of the sector, 1e-9."""
     scene = Scene(sector(name))

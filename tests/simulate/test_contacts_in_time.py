@@ -106,7 +106,12 @@ def test_a_driven_ball_does_the_work() -> None:
     assert abs(found[-1]["imbalance"]) < 1e-5 * abs(found[-1]["work"])
 
 
-SHOWN_ABOVE = ("the same, fixed step", "viscous cap on a ball")  # an impact that conserves energy, a cap that stays
+SHOWN_ABOVE = (
+    "the same, fixed step",  # an impact that conserves energy
+    "plate thrown at a ball",  # its steps see the balance
+    "cap released", "ball driven in",  # a driven ball does the work
+    "viscous cap on a ball",  # which stays
+)  # fmt: skip
 
 
 @pytest.mark.slow

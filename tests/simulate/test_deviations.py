@@ -75,7 +75,7 @@ def further(data: dict[str, Any], w0: str, c: float) -> Case:
         pytest.param(CAP | {"loading": DEAD}, AROUND, "load", ["top_uz", "w_over_h"], id="meridian"),
         pytest.param(
             CAP | {"loading": PUSHED, "symmetry": "half", "mesh": {"degree": 3, "size": "0.2 m"}}, AROUND,
-            "force", ["w_over_h"], id="half",
+            "force", ["w_over_h"], id="half", marks=pytest.mark.slow,
         ),
     ],
 )  # fmt: skip

@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 from conftest import CASES
 from numpy.typing import NDArray
+from test_field_gradients import neutral
 
 from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.gradient import gradient
+from magshell_fenicsx.simulate.numbers import scene_with
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
 from magshell_fenicsx.simulate.sensitivity import fold_at
@@ -69,6 +72,14 @@ def solved(scene: Scene) -> Record:
     return last
 
 
+def at(scene: Scene, near: State) -> State:
+    """The equilibrium at the amplitudes of a state near by, to rounding."""
+    solution = scene.newton.solve(near, "lambda_m", GivenLoad("lambda_m", near.mu["lambda_m"]))
+    assert solution.converged
+    u, mu = solution.state.u, solution.state.mu
+    return State(u - scene.newton.factor_at(solution.state).solve(scene.model.system.residual(u, mu)), mu)
+
+
 def circle(x: Array) -> Array:
     """Half of one, of the strip's length."""
     return np.column_stack([np.sin(np.pi * x[:, 0]), np.pi * x[:, 1], 1 - np.cos(np.pi * x[:, 0])]) / np.pi
@@ -88,29 +99,30 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
     scene = Scene(case)
     last, before = solved(scene), scene.newton.factorisation.count
     one = with_values(scene, 0 * CHANGE)
-    others = {
-        c: (moved, solved(moved)) for c in (-2e-3, -1e-3, 1e-3, 2e-3) for moved in [with_values(scene, c * CHANGE)]
-    }
+    near, step = last.point.state, 1e-4
+    others = {c: (moved, at(moved, near)) for c in (-step, step) for moved in [with_values(scene, c * CHANGE)]}
     assert one.problem.half == scene.problem.half == (symmetry == "auto")
     for of in ("tip_uz", circle, "energy"):
         found = gradient(scene, last, of=of, by=["remanence"])["remanence"]
 
-        def value(c: float, of: object = of) -> float:
-            there, record = others[c]
-            return functional(there, record.point.state, of).value  # type: ignore[arg-type]
-
-        expected = by_difference(value, 1e-3)
+        back, ahead = (functional(*each, of).value for each in others.values())
+        expected = (ahead - back) / (2 * step)
         assert np.sum(of_points(scene, found) * CHANGE) == pytest.approx(expected, rel=1e-6)
     assert scene.newton.factorisation.count <= before + 1  # for all results together
-    numbers = {"lambda_m": ("magnetic.lambda_m", 3.3e-5), "shell.poisson_ratio": ("shell.poisson_ratio", 0.2)}
-    found_numbers = gradient(scene, last, of="tip_ux", by=list(numbers))
-    for name, (key, at) in numbers.items():
+    key, ratio = "shell.poisson_ratio", 0.2
+    found_numbers = gradient(scene, last, of="tip_ux", by=["lambda_m", key])
 
-        def other(c: float, key: str = key, at: float = at) -> float:
-            there = Scene(Case.load(strip, [f"symmetry={symmetry}", f"{key}={at * (1 + c)}"]))
-            return functional(there, solved(there).point.state, "tip_ux").value
+    def in_field(c: float) -> float:
+        state = at(scene, near.with_(near.u, "lambda_m", 3.3e-5 * (1 + c)))
+        return functional(scene, state, "tip_ux").value
 
-        assert found_numbers[name] == pytest.approx(by_difference(other, 1e-2) / at, rel=1e-5), name
+    def softer(c: float) -> float:
+        there = scene_with(scene, key, ratio * (1 + c))
+        return functional(there, at(there, near), "tip_ux").value
+
+    assert found_numbers["lambda_m"] == pytest.approx(by_difference(in_field, 1e-2) / 3.3e-5, rel=1e-5)
+    by_ratio = (softer(1e-3) - softer(-1e-3)) / (2e-3 * ratio)
+    assert found_numbers[key] == pytest.approx(by_ratio, rel=1e-5)
 
 
 def turning(a: Array) -> tuple[Array, Array]:
@@ -163,15 +175,15 @@ def test_fold_by_remanence_and_thickness(tmp_path: Path, settings: list[str]) ->
 
 
 def test_neutral_wave(tmp_path: Path) -> None:
-    """A wave around the axis that is neutral before the fold; its pressure found again by a path."""
-    settings = ["loading={kind: pressure, until: bifurcation, control: arc}", "shell.defect.amplitude=0.05"]
+    """A wave around the axis that is neutral before the fold; its pressure found again."""
+    settings = ["loading={kind: pressure, until: bifurcation, control: arc}", "shell.defect.amplitude=0.005"]
+    settings += ["shell.radius_to_thickness=20", "mesh.degree=3"]  # a short path
     scene = folded(tmp_path, *settings, polar=lambda a: (0.2 * np.sin(3 * a), 1 + 0 * a))
     change = np.random.default_rng(3).standard_normal((7, 2))
     wave = solved(scene)
     assert wave.mode.startswith("m = ")
     found = gradient(scene, wave, of="instability", by=["remanence", "lambda_m", "magnetic.lambda_m"])
-    near = (with_values(scene, c * change) for c in (-1e-3, 1e-3))
-    back, ahead = (adjoint_of_instability(other, solved(other)).value for other in near)
+    back, ahead = (neutral(with_values(scene, c * change), wave) for c in (-1e-3, 1e-3))
     expected = (ahead - back) / 2e-3
     assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(expected, rel=1e-4)
     whole = np.sum(of_points(scene, found["remanence"]) * scene.problem.loads.magnetic.remanent.values)  # type: ignore[union-attr]

@@ -133,6 +133,7 @@ def test_a_sealed_shell_keeps_its_volume() -> None:
     assert np.abs(same.point.state.u - end.u).max() < 1e-7 * np.abs(end.u).max()
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed(no_pictures: None, tmp_path: Path) -> None:
     def stop(line: str) -> None:
         if line.lstrip().startswith("3 "):

@@ -42,28 +42,11 @@ TUBE = {
     "loading": FOLLOWED,
 }
 FINER = {"mesh": {"refinement": 1.5}}
-DOME = {
-    "shell": {"geometry": "hemisphere", "radius": "1 m", "thickness": "30 mm", "poisson_ratio": 0.3},
-    "boundary": {"equator": "clamped"},
-    "loading": FOLLOWED,
-}
 BARREL = {
     "shell": {
         "geometry": "revolution",
         "profile": {"radius": "1 - 0.2*z**2", "heights": [-0.8, 0.8]},
         "thickness": 0.04,
-        "poisson_ratio": 0.3,
-    },
-    "boundary": {"bottom": "clamped", "top": "clamped"},
-    "loading": FOLLOWED,
-}
-TORUS = {  # the outer part
-    "shell": {
-        "geometry": "torus",
-        "radius": 1.0,
-        "tube_radius": 0.5,
-        "tube": [-40, 40],
-        "thickness": 0.05,
         "poisson_ratio": 0.3,
     },
     "boundary": {"bottom": "clamped", "top": "clamped"},
@@ -76,10 +59,7 @@ BALL = {  # more than half of a sphere
 }
 WAVES = {  # the larger model's mesh, and w0 of h/10000 at most: it changes the load by its part of the waves' height
     "cap": (CAP | FINER, 5, FINER, "0.003*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
-    "tube": (TUBE, 4, {"mesh": {"size": 0.2}}, "0.0001*sin(pi*z/2)*(x**4 - 6*x**2*y**2 + y**4)"),
     "barrel": (BARREL | FINER, 6, FINER, "0.0001*cos(6*arctan2(y, x))"),
-    "torus": (TORUS | FINER, 10, FINER, "0.0001*cos(10*arctan2(y, x))"),
-    "dome": (DOME | FINER, 8, FINER, "0.0001*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
     "ball": (BALL | FINER, 8, FINER, "1e-5*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
 }
 
@@ -133,8 +113,7 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("symmetry", ["half", 3])
-def test_an_instability_is_located_on_the_path(symmetry: str | int) -> None:
+def test_an_instability_is_located_on_the_path() -> None:
     """Of a cap on a bed: other branches pass near its first bifurcation, at smaller loads (0.760 and 0.783)."""
     cap = CAP["shell"] | {"radius": "25 mm", "thickness": "0.25 mm", "youngs_modulus": "1 MPa", "polar": 22.0}
     case = CAP | {
@@ -148,14 +127,18 @@ def test_an_instability_is_located_on_the_path(symmetry: str | int) -> None:
             for record in follow(Scene(problem_of(case | other)))
             if record.label == "bifurcation"
         )
-        for other in ({}, {"symmetry": symmetry})
+        for other in ({}, {"symmetry": 3})
     ]
     assert loads[1] == pytest.approx(loads[0], rel=1e-3)
 
 
 def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     """Load, energy and deflection of the meridian; the mode's stiffness is zero in both models."""
-    records = list(follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None))
+    way, records = follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None), []
+    for record in way:
+        records.append(record)
+        if record.scene is not records[0].scene:  # what follows is the branch
+            break
     old, new = next((a, b) for a, b in pairwise(records) if a.mode == "m = 5")
     assert new.scene is not old.scene
     assert old.scene
@@ -223,6 +206,7 @@ def test_the_branch_of_a_tube_has_the_curvature_of_koiters_theory(monkeypatch: p
     assert b0 - x0 * (b1 - b0) / (x1 - x0) == pytest.approx(b, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_half_hands_over_to_the_whole_shell() -> None:
     """A shallow pinned arch of rise parameter 2.6 buckles to one side before its fold (Fung and Kaplan 1952).
 
@@ -291,14 +275,12 @@ def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: P
     wanted = read_path(one)
     content = (one / "fields" / "path.pvd").read_text()
     assert content.count("point_") == len(wanted)
-    for limit in (1, 4):
-        magshell("run", case, "--out", cut, "--no-pictures", "--time-limit", str(limit), *(["--resume"] * (limit > 1)))
+    magshell("run", case, "--out", cut, "--no-pictures", "--time-limit", "2")
     assert magshell("run", case, "--out", cut, "--no-pictures", "--resume").returncode == 0
-    for ranks in (2, 3):
-        out = tmp_path / f"ranks_{ranks}"
-        assert magshell("run", case, "--out", out, "--no-pictures", ranks=ranks).returncode == 0
-    for out in (cut, tmp_path / "ranks_2", tmp_path / "ranks_3"):
-        for row, there in zip(read_path(out), wanted, strict=True):
+    out = tmp_path / "ranks_2"
+    assert magshell("run", case, "--out", out, "--no-pictures", ranks=2).returncode == 0
+    for folder in (cut, out):
+        for row, there in zip(read_path(folder), wanted, strict=True):
             assert (row["label"], row["mode"], row["excluded_pivots"]) == (
                 there["label"],
                 there["mode"],

@@ -32,6 +32,7 @@ def test_laws_agree_where_nothing_stretches(model: str) -> None:
     assert all(30 * apart[0] < other < 1e-4 for other in apart[1:])
 
 
+@pytest.mark.slow
 def test_uniform_field_as_formulas() -> None:
     coarse = ["mesh.refinement=0.4"]
     as_formulas = tip([*coarse, "magnetic.applied={components: ['0', '0', '1']}"])

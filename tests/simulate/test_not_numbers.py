@@ -50,7 +50,7 @@ def test_at_the_begin(energy: object, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "summary.json").exists()
 
 
-@pytest.mark.parametrize("step", [LOADED, MOVING])
+@pytest.mark.parametrize("step", [pytest.param(LOADED, marks=pytest.mark.slow), MOVING])
 def test_on_the_way(step: dict[str, object], tmp_path: Path) -> None:
     """Steps become small, then the run stops; its points are there."""
     case = Case.from_source(Source("test", {**CAP, "loading": [step]}))

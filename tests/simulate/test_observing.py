@@ -43,6 +43,7 @@ def energies(scene: Scene, records: list[Record]) -> list[float]:
     return [scene.observe(record.point.state)["energy"] for record in records]
 
 
+@pytest.mark.slow
 def test_a_strip_rolled_up() -> None:
     """Seen on the way, and without what came before: the energy of a moment M on a strip is -M angle/2."""
     scene, seen, records = Scene(strip(BY_LOAD)), list[float](), list[Record]()
@@ -154,7 +155,12 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     return [shown, np.array(numbers), system.residual(u, mu), system.forces(u, mu), *columns, *values]
 
 
-@pytest.mark.parametrize("kind", OF_ALL_KINDS)
+SLOW = "contact and growing dimple of half a shell"
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(each, marks=[pytest.mark.slow] * (each == SLOW)) for each in OF_ALL_KINDS]
+)
 def test_in_any_order(kind: str) -> None:
     """To the last bit, in order, at random, twice, and by a scene that has seen nothing else."""
     case = Case.from_source(Source(kind, OF_ALL_KINDS[kind]))

@@ -95,6 +95,7 @@ def of(data: dict[str, Any]) -> Case:
     return Case.from_source(Source("case.yaml", data))
 
 
+@pytest.mark.slow
 def test_modes_of_several_shells() -> None:
     """The thinner of two caps apart, upside down, buckles as it does alone, 1e-8, and the other one stays.
 
@@ -120,6 +121,7 @@ def test_modes_of_several_shells() -> None:
         run(two(one(0.02, **place)))
 
 
+@pytest.mark.slow
 def test_modes_of_shells_that_are_joined() -> None:
     """A column of two plates, each with its part of the mode, bends as one plate with it does: 1e-3, by the mesh."""
 

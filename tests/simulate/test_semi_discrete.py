@@ -31,6 +31,7 @@ def slow(t: float, before: bool = True) -> dict[str, float]:
     return pressure(t / 5)
 
 
+@pytest.mark.slow
 def test_second_order_towards_scipy() -> None:
     """Displacement and velocity of every node to 1e-6 of the largest; a half of the step leaves a quarter."""
     scene = scene_of("axisymmetric", degree=2, refinement=0.2)

@@ -43,6 +43,7 @@ def test_accelerated_support() -> None:
     assert np.ptp(energy) < 1e-3 * found["work"].max()
 
 
+@pytest.mark.slow
 def test_a_kink_is_an_impulse() -> None:
     """A root that starts and stops at once: the energies add up over both impulses."""
     found = moved(
@@ -53,6 +54,7 @@ def test_a_kink_is_an_impulse() -> None:
     assert found["work"].max() > 0
 
 
+@pytest.mark.slow
 def test_drag_and_sine() -> None:
     history = f"{SMALL} + 0.01*(1 - cos(6*pi*t/{PERIOD}))"
     found = moved(history, drag=0.05 * BEAM, duration=PERIOD / 2, step=PERIOD / 300)

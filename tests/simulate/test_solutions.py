@@ -64,6 +64,7 @@ def test_a_roof_has_snapped_through() -> None:
     assert min(apart(scene, back[0].point.state, other) for other in (result.last, found[0])) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_search_for_stable_solutions() -> None:
     """It ends at the snapped roof: the equilibrium between, which is unstable, does not count."""
     result = ms.run(roof("mesh.size=127", "loading.search={solutions: 1, stable: true}"))
@@ -74,6 +75,7 @@ def test_a_search_for_stable_solutions() -> None:
     assert apart(result.scene, state, snapped) < 1e-8
 
 
+@pytest.mark.slow
 def test_what_a_step_holds_stays_held() -> None:
     """Sze's thin roof snaps back: under one displacement of its middle it has three equilibria, the second unstable."""
     push, more = (f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5))
@@ -120,6 +122,7 @@ def test_a_search_whose_time_is_over_ends_the_run_well() -> None:
     assert not result.found
 
 
+@pytest.mark.slow
 def test_solid_roof() -> None:
     """The solid has three equilibria near those of the shell; shear and the hinges in the middle line make 2 %."""
     shell, solid = (

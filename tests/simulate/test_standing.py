@@ -19,7 +19,8 @@ shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.
 boundary: {root: clamped}
 magnetic: {lambda_m: 3.3e-5, remanent: {kind: points, file: one.csv, filter: 0.3}, applied: {polar: 0}}
 natural: {curvature: [0, 0, 0]}
-mesh: {degree: 2}
+mesh: {degree: 2, refinement: 0.4}
+loading: {kind: field, points: 2}
 """
 OTHER = ["magnetic.remanent.file=two.csv", "shell.thickness_factor=1 + x/5", "natural.curvature=[0.3*x, 0.1, 0]"]
 BUCKLING = ["shell.thickness_factor=1 + 0*z", "natural={curvature: [0, 0, 0]}", "magnetic.lambda_m=0.001"]
@@ -35,6 +36,7 @@ def test_half_strip(tmp_path: Path) -> None:
     agree(Case.load(tmp_path / "strip.yaml"), Case.load(tmp_path / "strip.yaml", OTHER))
 
 
+@pytest.mark.slow
 def test_meridian() -> None:
     agree(*(Case.load(CASES / "dimple_buckling.yaml", settings) for settings in (BUCKLING, THICKER)))
 
@@ -42,16 +44,15 @@ def test_meridian() -> None:
 def agree(first: Case, second: Case) -> None:
     """Forwards and back."""
     scene = Scene(first)
-    there = [record.point.state for record in follow(scene)][-1]
-    for case in (second, first):
+    *_, there = follow(scene)
+    *_, other = follow(Scene(second))
+    for case, expected in ((second, other), (first, there)):
         assert refilled(scene, case.problem())
         *_, last = follow(scene)
-        *_, expected = follow(Scene(case))
         assert last.label == expected.label
         assert last.point.state.mu == pytest.approx(expected.point.state.mu, rel=1e-10)
         size = np.abs(expected.point.state.u).max()
         np.testing.assert_allclose(last.point.state.u, expected.point.state.u, rtol=0, atol=1e-9 * size)
-    np.testing.assert_allclose(last.point.state.u, there.u, rtol=0, atol=1e-9 * size)
 
 
 def test_another_case_is_another_scene() -> None:

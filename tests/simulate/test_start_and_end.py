@@ -84,6 +84,7 @@ def test_mistakes(given: dict[str, Any], message: str) -> None:
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_viscous_motion_resumed(tmp_path: Path, no_pictures: None) -> None:
     """Stopped by its time limit, with strains of a branch to remember: the same rows."""
     shell = STRIP["shell"] | {"relaxation": [{"modulus": 0.3, "time": 1 / BEAM}]}

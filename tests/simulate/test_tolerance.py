@@ -6,6 +6,7 @@ of this program, 15.14768, which the independent mixed elements have within 5e-5
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import basix
@@ -37,41 +38,45 @@ def indentation(tolerance: float) -> Case:
     return Case.load(CASES / "indentation.yaml", settings)
 
 
-def check(case: Case, reference: float) -> Adapted:
+def check(case: Case, reference: float, mesh: Adapted | None = None) -> None:
     """The path on the mesh that was found ends where the rounds did, with an error as it was asked for.
 
     On a meridian, whose cells cost nothing, it may be far smaller.
     """
-    mesh, tolerance = adapted(case.problem(), COMM), case.mesh.tolerance
+    mesh, tolerance = mesh or adapted(case.problem(), COMM), case.mesh.tolerance
     assert tolerance
     end = by_path(mesh.choice.scene(case.problem(), COMM))
     error = abs(end.value / reference - 1)
     assert end.value == pytest.approx(mesh.best.result, rel=1e-7)
     assert (0.0 if mesh.choice.applied(case.problem()).axisymmetric else tolerance / 10) < error < tolerance
     assert error < max(mesh.best.estimate, 1e-8)
-    return mesh
+
+
+@cache
+def mesh_for(case: tuple[float, float]) -> Adapted:
+    """The mesh of a half for a tolerance and a field."""
+    return adapted(buckling(*case).problem(), COMM)
 
 
 @pytest.fixture(scope="module")
 def half_mesh() -> Adapted:
-    return adapted(buckling(1e-2).problem(), COMM)
+    return mesh_for((1e-2, 0.0))
 
 
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
 def test_knockdown_on_the_meridian(tolerance: float) -> None:
     check(buckling(tolerance, symmetry="auto"), KNOCKDOWN[0.0])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tolerance", "lambda_m"), [(1e-2, 0.0), (1e-3, -0.00184), (1e-4, 0.00184)])
+@pytest.mark.parametrize(("tolerance", "lambda_m"), [(1e-2, 0.0), (1e-3, -0.00184)])
 def test_knockdown(tolerance: float, lambda_m: float) -> None:
-    check(buckling(tolerance, lambda_m), KNOCKDOWN[lambda_m])
+    check(buckling(tolerance, lambda_m), KNOCKDOWN[lambda_m], mesh_for((tolerance, lambda_m)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
-def test_force(tolerance: float) -> None:
-    check(indentation(tolerance), FORCE)
+def test_force() -> None:
+    check(indentation(1e-2), FORCE)
 
 
 @pytest.mark.slow
@@ -79,7 +84,7 @@ def test_grading_by_the_indicator_takes_fewer_unknowns() -> None:
     """Than the default grading, refined as a whole, for an error that is not smaller."""
     lambda_m = -0.00184
     case = buckling(1e-3, lambda_m)
-    graded, whole = adapted(case.problem(), COMM), Choice(4, 0.5)
+    graded, whole = mesh_for((1e-3, lambda_m)), Choice(4, 0.5)
     near = graded.choice.scene(case.problem(), COMM)
     scene = whole.scene(case.problem(), COMM)
     error = abs(from_near(scene, near, by_path(near)).value / KNOCKDOWN[lambda_m] - 1)
@@ -92,6 +97,7 @@ def dome(thickness: float, height: float, **shell: object) -> dict[str, object]:
     return {"shell": keys | shell, "boundary": {"rim": "clamped"}, "place": {"position": [0, 0, height]}}
 
 
+@pytest.mark.slow
 def test_ends_of_several_shells_are_carried() -> None:
     """Each gives its own to itself, though they cross in space: exact to a higher degree, and the fold of its path."""
     flaw = {"kind": "gaussian", "amplitude": 0.5, "width": 1.5, "at": {"polar": 10}}

@@ -33,7 +33,7 @@ def ended(applied: dict[str, Any], loading: Any, model: str = "shell") -> tuple[
     return scene, last.point.state
 
 
-@pytest.mark.parametrize("model", ["shell", "solid"])
+@pytest.mark.parametrize("model", ["shell", pytest.param("solid", marks=pytest.mark.slow)])
 def test_a_gradient(model: str) -> None:
     """From e1 to e2 and on to e3."""
     steps = [FIELD, {"kind": "rotation", "to": Y, "points": 2}, {"kind": "rotation", "to": Z, "points": 2}]
@@ -50,6 +50,7 @@ def test_formulas() -> None:
     agrees(ended(before, [FIELD, {"kind": "rotation", "to": X, "points": 2}]), ended(after, [FIELD]))
 
 
+@pytest.mark.slow
 def test_sources_that_move() -> None:
     """Beside a uniform field: one magnet moves, both turn with the field from e3 to e1, then the other one moves."""
     beside = {"flux_density": "5 mT", **Z}
@@ -76,6 +77,7 @@ def agrees(turned: tuple[ms.Scene, Any], standing: tuple[ms.Scene, Any]) -> None
     assert here["field_angle"] == pytest.approx(90)
 
 
+@pytest.mark.slow
 def test_one_that_is_switched_off_and_on() -> None:
     """It keeps its direction while its strength falls to zero and grows again."""
     steps: list[dict[str, Any]] = [FIELD, {"kind": "rotation", "to": Z, "points": 2}]

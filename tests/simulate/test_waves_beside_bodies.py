@@ -22,8 +22,6 @@ PRESSURE: dict[str, Any] = {"kind": "pressure", "control": "load", "until": "tar
 APART = {
     "stop": {"kind": "sphere", "radius": 0.05, "side": "inside", "at": {"polar": 0}, "position": [0, 0, 0.7]},
 }
-BALL = {"ball": {"kind": "sphere", "radius": 0.3}}
-LESS: dict[str, Any] = PRESSURE | {"pressure": 0.7, "points": 1}
 APPROACH = {"kind": "contact", "approach": 0.8, "points": 1}
 TOUCH = APPROACH | {"approach": 0.3}
 GAS = {"pressure": {"gas": {"ambient_over_pc": 3}}}
@@ -40,13 +38,11 @@ FIELD = {"kind": "field", "factor": 1.3, "points": 2}
 DIMPLE = {"kind": "dimple", "amplitude": 1.0, "width": 3}
 BEYOND = {"kind": "pressure", "control": "volume", "until": "target", "volume_change": -0.068, "points": 1}
 PUSH = {"kind": "indentation", "at": {"polar": 0}, "control": "load", "until": "target", "force": 0.1, "points": 1}
-SIX: dict[str, tuple[dict[str, Any], list[int]]] = {
+KINDS: dict[str, tuple[dict[str, Any], list[int]]] = {
     "a plate": (
         {"bodies": {"plate": {"kind": "plane"}}, "loading": [APPROACH | {"approach": 0.3}, PRESSURE]},
         [0, 0, 4],
     ),
-    "a body apart": ({"bodies": APART, "loading": PRESSURE}, [0, 4]),
-    "a ball over gas": ({"bodies": BALL, "loading": [LESS, APPROACH | {"hold": GAS}]}, [0, 0]),
     "a magnet over gas": ({**MAGNETIC, "loading": [PRESSURE, FIELD | {"hold": GAS}]}, [0, 4, 4, 5]),
     "a magnet over a volume": (
         {**MAGNETIC, "loading": [PRESSURE, FIELD | {"hold": {"pressure": "conjugate"}}]},
@@ -57,6 +53,9 @@ SIX: dict[str, tuple[dict[str, Any], list[int]]] = {
         [0, 0],  # at the end one direction is unstable at the given pressure, and none over the gas
     ),
 }
+
+
+FULL = ("a plate", "a magnet over gas")
 
 
 def scene_of(**sections: object) -> Scene:
@@ -86,16 +85,19 @@ def test_until_bifurcation_ends_at_the_first() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", KINDS)
 def test_half_and_full_shell_have_as_many_unstable_directions(name: str) -> None:
     """Of each wave one is symmetric and one antisymmetric, and the full shell has both, at every point of the path.
+
+    The full shell is solved for two kinds: beside a contact, and over a gas.
 
     Where a wave is neutral its pair is zero on the meridian, and on another mesh it is not: there a half may have one
     more and the full shell two. Over the gas, at m = 9, the pair of the full shell is 3e-6 and -2e-5 with 6 825
     unknowns, -2e-8 and -6e-7 with 16 317, -1e-8 and -6e-8 with 36 033, where the next ones are 4e-5.
     """
-    sections, targets = SIX[name]
-    meridian, half, full = (scene_of(**sections, symmetry=each) for each in ("auto", "half", "none"))
+    sections, targets = KINDS[name]
+    meridian, half = (scene_of(**sections, symmetry=each) for each in ("auto", "half"))
+    full = scene_of(**sections, symmetry="none") if name in FULL else None
     assert half.model.excluded_modes is not None
     (family,) = half.model.excluded_modes.families
     records = list(follow(meridian))
@@ -106,6 +108,8 @@ def test_half_and_full_shell_have_as_many_unstable_directions(name: str) -> None
         here = on(meridian, half, record, solve=not neutral)
         assert family.factor_at(here).negative_pivots - waves in range(1 + neutral)
         assert unstable(meridian, half, record, here) - all_of_meridian in range(1 + neutral)
+        if full is None:
+            continue
         there = on(meridian, full, record, solve=not neutral)
         assert unstable(meridian, full, record, there) - all_of_meridian - waves in range(1 + 2 * neutral)
 
