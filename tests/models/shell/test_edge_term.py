@@ -1,4 +1,4 @@
-"""One's own energies on a named edge: closed forms on mid-surface, meridian and half, and what is refused."""
+"""One's own energies on a named edge: closed forms on meridian and half, and what is refused."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.shell import ShellModel
 
 H, NU = 0.02, 0.3
-MODELS = ["axisymmetric", "half", "none"]
+MODELS = ["axisymmetric", "half"]
 
 
 def pull(r0: Jet, u: Jet, edge: Edge) -> Expr:
@@ -42,7 +42,7 @@ def hinge(r0: Jet, u: Jet, edge: Edge) -> Expr:
 
 def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any) -> dict[str, float]:
     """What is observed at a small load of one amplitude."""
-    data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.7}, **sections}
+    data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.5}, **sections}
     scene = ms.Scene(ms.Case.from_source(Source("test", data)), terms=terms)
     *_, end = ms.trace(scene, amplitude, targets=[target])
     return scene.observe(end.point.state)
@@ -84,7 +84,7 @@ def test_plate_on_an_elastic_hinge(symmetry: str) -> None:
     assert found["w_pole_over_h"] * H == pytest.approx(load / (64 * D) * (5 + NU + K) / (1 + NU + K), rel=2e-4)
 
 
-@pytest.mark.parametrize("density", [pull, ring, hinge])
+@pytest.mark.parametrize("density", [ring, hinge])
 def test_residual_and_tangent(density: Any) -> None:
     """Of the point derivatives against those of the forms."""
     loads = Loads(pressure=True, own=(ms.OwnTerm("own", density, on="rim"),))
@@ -99,7 +99,7 @@ def test_symmetry() -> None:
     sided = Mirror(np.array([1.0, 0.0, 0.0]), 0.5, {"right": "left"})
     assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
     assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)
-    for density in (pull, ring, hinge):
+    for density in (ring, hinge):
         term = ms.OwnTerm("own", density, on="rim")
         assert (term.turns, term.mirrored(Y0)) == (True, True)
     along = ms.OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.along, u.r), on="rim")
