@@ -70,17 +70,15 @@ PROBLEMS: dict[str, dict[str, Any]] = {
 }
 
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.02, "points": 1}
-PROBLEMS |= {
-    f"tube under pressure, top {name}": {
-        "shell": CYLINDER,
-        "boundary": {"bottom": "clamped", "top": top},
-        "points": {"A": [0, 1, 0.4]},
-        "loading": PRESSED,
-    }
-    for name, top in {"sliding": {"held": ["x", "y"]}, "in a plane": "symmetry", "free": "free"}.items()
+PROBLEMS["tube under pressure, top in a plane"] = {
+    "shell": CYLINDER,
+    "boundary": {"bottom": "clamped", "top": "symmetry"},
+    "points": {"A": [0, 1, 0.4]},
+    "loading": PRESSED,
 }
 
 FINER = {
+    "part of a torus": 0.18,
     "cap with a hole in a field": 0.1,
     "vase of varying thickness": 0.09,
     "tube under pressure, top in a plane": 0.12,
@@ -105,7 +103,7 @@ def test_meridian_and_triangles(name: str) -> None:
     """To the error of the triangles, which falls with the fourth power of their size: see FINER."""
     scene, line = ended(PROBLEMS[name], "auto", {"degree": 3})
     assert scene.problem.axisymmetric
-    _, half = ended(PROBLEMS[name], "half", {"degree": 3, "size": FINER.get(name, 0.18)})
+    _, half = ended(PROBLEMS[name], "half", {"degree": 3, "size": FINER.get(name, 0.25)})
     for column in ("energy", "volume_change", "w_over_h", "w_pole_over_h", "A_uy", "A_uz"):
         assert line[column] == pytest.approx(half[column], rel=5e-3, abs=1e-15), column
 
@@ -176,7 +174,6 @@ def test_waves_of_a_hinged_cylinder() -> None:
 
 WAVY: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"bottom": "clamped", "top": "clamped"}, {"kind": "pressure"}),
-    ({"bottom": "clamped", "top": {"held": ["x", "y"]}}, {"kind": "pressure"}),
     ({"bottom": "clamped", "top": "free"}, {"kind": "pressure"}),
     ({"bottom": "clamped"}, {"kind": "dead", "loads": [{"edge": "top", "moment": 1e-5}]}),
 ]
