@@ -68,10 +68,9 @@ def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
     return scene, last.point.state, scene.observe(last.point.state)
 
 
-@pytest.mark.parametrize("modulus", [1.0, 4.0])
-def test_stiffened_plate(modulus: float) -> None:
+def test_stiffened_plate() -> None:
     """F L^3/(3 EI) of the T-shaped section, 3e-3; the tip is that of the plate, not of the web at the same place."""
-    length, height = 4.0, 0.1
+    length, height, modulus = 4.0, 0.1, 4.0
     flange, web = WIDTH * h, modulus * height * h
     axis = web * height / 2 / (flange + web)
     EI = WIDTH * D + flange * axis**2 + web * height**2 / 12 + web * (height / 2 - axis) ** 2

@@ -50,7 +50,6 @@ def swells(case: ms.Case, centre: list[float]) -> dict[str, float]:
     return found
 
 
-@pytest.mark.slow
 def test_hemisphere_swells_without_stress() -> None:
     """On a mirror plane, with h/R = 0.02: u = (lambda - 1) r0, to rounding."""
     case = load(
@@ -63,7 +62,6 @@ def test_hemisphere_swells_without_stress() -> None:
     assert swells(case, [0, 0])["volume_change"] == pytest.approx((1.3**3 - 1) * 2 * np.pi / 3, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_hemisphere_of_triangles_swells_without_stress() -> None:
     """Its cubic edges leave the nodes 1e-6 beside the mirror plane, into which they are moved."""
     case = load(
@@ -77,7 +75,6 @@ def test_hemisphere_of_triangles_swells_without_stress() -> None:
     assert swells(case, [0, 0, 0])["volume_change"] == pytest.approx((1.3**3 - 1) * 2 * np.pi / 3, rel=3e-4)
 
 
-@pytest.mark.slow
 def test_cap_swells_without_stress() -> None:
     """On its triangles, held in a statically determinate way, with a free edge."""
     s, c = float(np.sin(np.radians(40))), float(np.cos(np.radians(40)))
@@ -98,7 +95,7 @@ def test_cap_swells_without_stress() -> None:
 def test_stretched_and_bent_strip() -> None:
     """Free of stress, a circle with kappa per natural length; so is a solid, to the error of its elements."""
     exact = -(1 - np.cos(1.05))
-    for model, mesh, error in (("shell", {"degree": 3, "size": 0.1}, 1e-6), ("solid", {"size": 0.05}, 1e-5)):
+    for model, mesh, error in (("shell", {"degree": 3, "size": 0.25}, 1e-6), ("solid", {"size": 0.1}, 1e-5)):
         case = load(
             model=model,
             shell=STRIP,
@@ -117,7 +114,7 @@ def test_bilayer() -> None:
     """Timoshenko 1925: two equal layers of a beam that grow apart by a strain e bend to kappa = 3 e/(2 h)."""
     e, layers = 1e-4, {"layers": 2}
     case = load(
-        model="solid", shell=STRIP, boundary={"root": "clamped"}, mesh={"size": 0.05}, solid=layers, symmetry="none"
+        model="solid", shell=STRIP, boundary={"root": "clamped"}, mesh={"size": 0.1}, solid=layers, symmetry="none"
     )
     problem = make_problem(case)
 
@@ -132,7 +129,6 @@ def test_bilayer() -> None:
     assert abs(found["w_pole_over_h"]) / 50 == pytest.approx((1 - np.cos(kappa)) / kappa, rel=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "symmetry", "shell", "size"),
     [("shell", "none", CAP, 1e-3), ("shell", "axisymmetric", CAP, 1e-3), ("solid", "none", STRIP, 1e-5)],
@@ -143,7 +139,7 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
     The residual changes with each amplitude, and so does the tangent.
     """
     natural = UNEVEN if symmetry == "none" else {"stretch": ["1.1 + 0.1*z", 0.95], "curvature": ["0.3 + z", 0.1, 0]}
-    mesh = {"refinement": 0.5} if model == "solid" else DEGREES[symmetry] | {"refinement": 0.3}
+    mesh = {"refinement": 0.5} if model == "solid" else DEGREES[symmetry] | {"refinement": 0.2}
     edge = "rim" if shell is CAP else "root"
     case = load(model=model, shell=shell, boundary={edge: "clamped"}, natural=natural, mesh=mesh, symmetry=symmetry)
     system = ms.Scene(case).model.system
@@ -182,7 +178,6 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
         assert abs(changed - K).max() > 1e-6 * abs(K).max()
 
 
-@pytest.mark.slow
 def test_fast_tangent_and_residual() -> None:
     """Those from point kernels are those of FFCx's forms."""
     case = load(
@@ -217,11 +212,11 @@ def test_the_same_in_every_shell() -> None:
         found = end(symmetry, refinement=refinement)
         return [abs(found[name] / meridian[name] - 1) for name in ("w_pole_over_h", "energy")]
 
-    coarse, fine, full = error("half", 1.0), error("half", 2.0), error("none", 1.0)
+    coarse, fine, full = error("half", 1.0), error("half", 2.0), error("none", 0.7)
     assert [a / b for a, b in zip(coarse, fine, strict=True)] == pytest.approx([7, 8], rel=0.2)  # order 3
     assert fine[0] < 3e-4
     assert full[0] < 3e-3
-    assert end("half", "solid")["w_pole_over_h"] == pytest.approx(meridian["w_pole_over_h"], rel=0.02)
+    assert end("half", "solid", refinement=0.5)["w_pole_over_h"] == pytest.approx(meridian["w_pole_over_h"], rel=0.02)
 
 
 def test_fields_of_what_is_held() -> None:
