@@ -23,7 +23,7 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel
 
 Shells = Callable[..., ShellModel]
-DEGREES = [2, pytest.param(5, marks=pytest.mark.slow)]
+DEGREES = [2, 5]
 TERMS = {
     "membrane": "full",
     "bending": "full",

@@ -97,7 +97,6 @@ def test_each_order_alone(energy: Callable[[MagneticEnergy, float], float]) -> N
 FIELD = replace(TILTED, gradient=G, across=(np.array([1.0, 0.0, 0.0]),), law="rotation")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["full", "second_consistent"])
 def test_derivatives(kind: MagneticEnergy) -> None:
     """Of each term, at a pattern: points against forms, and these against finite differences."""
