@@ -48,16 +48,11 @@ def made(shell: dict[str, Any], boundary: dict[str, str], **sections: Any) -> Sc
     return Scene(Case.model_validate({"shell": {"poisson_ratio": 0.3, **shell}, "boundary": boundary, **sections}))
 
 
-HALF = {**ASIDE, "position": [0.035, 0.0, -0.02]}
 KINDS = {
     "shell": lambda: made(PLATE, {"left": "clamped"}, magnetic=field([ASIDE, COIL], flux_density="20 mT", polar=30),
                           loading=STEPS, mesh={"degree": 3, "size": 0.03}),
     "rotation law": lambda: made(PLATE, {"left": "clamped"}, loading=STEPS, mesh={"degree": 2, "size": 0.03},
                                  magnetic={**field([ASIDE, COIL]), "remanence": "rotation"}),
-    "half": lambda: made({"geometry": "strip", "radius": "30 mm", "width": 0.4, "thickness": "1 mm",
-                          "youngs_modulus": "1 MPa"}, {"root": "clamped"}, symmetry="half", mesh={"degree": 3},
-                         magnetic=field([HALF, COIL]),
-                         loading=[s for s in STEPS if s.get("name") != "turn"]),
     "meridian": lambda: made(RING, {"inner": "clamped"}, symmetry="axisymmetric",
                              magnetic={**field([BELOW]), "remanent": {"kind": "radial", "flux_density": "100 mT"}},
                              loading=UP),

@@ -203,6 +203,7 @@ def test_nearest_places() -> None:
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
 
 
+@pytest.mark.slow
 def test_the_least_gap_of_shells_that_are_apart() -> None:
     """As of the search for all places within the reach, in few of these; with the images of a
     sector."""

@@ -128,6 +128,7 @@ def test_derivatives() -> None:
     check_derivatives(scene, flattened(scene), (0.05 * h, 0.3 * h), h)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_natural_stretch() -> None:
     """The slope of the energy, of the forces and of the slope itself: differences of fourth order, 1e-6."""
     load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]

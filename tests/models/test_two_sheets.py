@@ -120,6 +120,7 @@ def test_check_knows_the_parts(tmp_path: Path) -> None:
         describe(Case.model_validate(data))
 
 
+@pytest.mark.slow
 def test_sheets_far_apart(tmp_path: Path) -> None:
     """Each bends as it does alone: 1e-10."""
     data = pair(tmp_path, (2, 2), (3, 2), 50.0)

@@ -15,7 +15,7 @@ MATERIAL = {"thickness": 0.02, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
 ANNULUS = {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, **MATERIAL}
 CYLINDER = {"geometry": "cylinder", "radius": 1.0, "length": 0.8, **MATERIAL}
 BULGE = {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "tube": [-60, 60], **MATERIAL}
-HOLED = {"geometry": "cap", "radius": 1.0, "polar": 60, "hole": 20, **MATERIAL}
+HOLED = {"geometry": "cap", "radius": 1.0, "polar": 40, "hole": 20, **MATERIAL}
 VASE = {"geometry": "revolution", "profile": {"points": [[1.0, 0.0], [0.8, 0.4], [0.9, 0.8]]}, **MATERIAL}
 EVERYWHERE = {"over": "all", "pressure": 2e-6}
 

@@ -99,9 +99,8 @@ def test_symmetry() -> None:
     sided = Mirror(np.array([1.0, 0.0, 0.0]), 0.5, {"right": "left"})
     assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
     assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)
-    for density in (ring, hinge):
-        term = ms.OwnTerm("own", density, on="rim")
-        assert (term.turns, term.mirrored(Y0)) == (True, True)
+    around = ms.OwnTerm("own", ring, on="rim")
+    assert (around.turns, around.mirrored(Y0)) == (True, True)
     along = ms.OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.along, u.r), on="rim")
     assert (along.turns, along.mirrored(Y0)) == (True, False)
 

@@ -67,6 +67,7 @@ def test_all_of_a_narrow_load_is_there(load, of, radius, mesh):
     assert -0.01 * column[:, 2].sum() == pytest.approx(-1e-7 * over_sphere(of, radius), rel=1e-3)  # times E h R
 
 
+@pytest.mark.slow
 def test_all_of_a_narrow_load_is_carried():
     """By the rim."""
     scene = Scene(dead(disc(0.02)))

@@ -95,6 +95,7 @@ def test_tangent_of_viscous_rubber() -> None:
     assert added[free] / rate == pytest.approx(force[free], abs=1e-4 * np.abs(force[free]).max())
 
 
+@pytest.mark.slow
 def test_creep() -> None:
     """Under a load c t, slow against all vibrations, w is c (t - g tau (1 - exp(-t/((1 + g) tau))))."""
     g, tau = 0.5, 1e4 / OMEGA
@@ -156,6 +157,7 @@ def steps_of(shell: dict[str, Any], steps: list[dict[str, Any]]) -> Case:
     return Case.from_source(Source("test", data | {"symmetry": "half", "loading": steps}))
 
 
+@pytest.mark.slow
 def test_damped_vibration_of_a_natural_shape() -> None:
     """A strip that has rolled up by its natural curvature: a mode of its own, of one freedom too."""
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
