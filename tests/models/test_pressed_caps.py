@@ -22,14 +22,14 @@ TURNED, MOVED = np.diag([1.0, -1, -1]), np.array([0, 0, 2 * TOP + h])  # the upp
 
 
 def pressed(**moves: float) -> dict[str, Any]:
-    """Rims that move along e3 by so many thicknesses for a factor of one, to 1 and 2."""
+    """Rims that move along e3 by so many thicknesses for a factor of one, to one."""
     moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
-    return {"kind": "edge", "name": "w", "control": "load", "factor": 2, "points": 2, "moves": moving}
+    return {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moving}
 
 
 @pytest.mark.slow
 def test_two_caps_are_one_on_a_plane() -> None:
-    """F at 1 and 2 h to 1e-3.
+    """F at h to 1e-3.
 
     The equilibrium of two begins as that of one and its image, and is solved. Two share a penetration, so that the same
     law has half the stiffness. The meshes do not match: one is the other turned, and a plane would mirror it.
@@ -66,4 +66,4 @@ def test_two_caps_are_one_on_a_plane() -> None:
         force = two.observe(outcome.state)["contact_force"] * two.model.force_unit
         assert force == pytest.approx(seen["reaction"] / h, rel=1e-3)
         compared += 1
-    assert compared == 2
+    assert compared == 1

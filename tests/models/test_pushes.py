@@ -19,7 +19,7 @@ def test_the_test_of_triangles() -> None:
 
 def test_the_distance_of_triangles() -> None:
     """Against the nearest of many places of both."""
-    one, other = np.random.default_rng(1).uniform(0, 1, (2, 20, 3, 3)) + np.array([0, 0, 1.5])[None, None] * [
+    one, other = np.random.default_rng(1).uniform(0, 1, (2, 8, 3, 3)) + np.array([0, 0, 1.5])[None, None] * [
         [[[0]]],
         [[[1]]],
     ]

@@ -78,7 +78,7 @@ def test_stiffened_plate() -> None:
     assert seen["base_tip_uz"] == pytest.approx(1e-9 * length**3 / (3 * EI), rel=3e-3)
 
 
-@pytest.mark.parametrize("height", [0.1, -0.1])
+@pytest.mark.parametrize("height", [0.1, pytest.param(-0.1, marks=pytest.mark.slow)])
 def test_a_mesh_file_in_which_edges_have_three_triangles(tmp_path: Path, height: float) -> None:
     """The same plate, read: the beam's deflection, 3e-3; with a web on both sides too, as an edge with four."""
     length, parts = 4.0, (16, 2)

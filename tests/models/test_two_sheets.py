@@ -100,11 +100,6 @@ def test_pieces_that_overlap(tmp_path: Path) -> None:
     data["contact"] = [["upper", "other"]]
     with pytest.raises(MeshError, match="contact: other: the surface has no such part, only lower, shell, upper"):
         Scene(Case.model_validate(data))
-    data = pair(tmp_path, (1, 1), (1, 1), 1.0)
-    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
-    data["contact"] = [["upper", "lower"], ["upper", "shell"]]
-    with pytest.raises(MeshError, match="contact: upper and shell: shares cells with upper and lower"):
-        Scene(Case.model_validate(data))
 
 
 def test_check_knows_the_parts(tmp_path: Path) -> None:

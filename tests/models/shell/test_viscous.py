@@ -35,7 +35,11 @@ def exact(polynomial: list[float], t: Any) -> Any:
     ("shell", "polynomial"),
     [
         ({"viscosity": 0.1 / OMEGA}, [1, 0.1, 1]),
-        ({"relaxation": [{"modulus": 0.3, "time": 1 / OMEGA}]}, [1, 1, 1.3, 1]),  # (s^2 + 1)(s + 1) + 0.3 s
+        pytest.param(
+            {"relaxation": [{"modulus": 0.3, "time": 1 / OMEGA}]},
+            [1, 1, 1.3, 1],  # (s^2 + 1)(s + 1) + 0.3 s
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_damped_vibration(shell: dict[str, Any], polynomial: list[float]) -> None:

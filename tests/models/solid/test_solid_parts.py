@@ -186,6 +186,7 @@ def test_a_foundation_under_the_outer_face() -> None:
     assert solid["A_uz"] == pytest.approx(shell["A_uz"], rel=H / 2)
 
 
+@pytest.mark.slow
 def test_a_closed_cylinder_dented_at_a_named_point() -> None:
     """The chart's seam is no slit: by h from the shell, as the patch is on the outer face."""
     loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 0.5, "points": 1, "patch": 2}
