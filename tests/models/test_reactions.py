@@ -102,6 +102,7 @@ def test_large_motion() -> None:
     assert power == pytest.approx(conjugate, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_half_and_whole() -> None:
     """The same grid, cut along its middle and whole: the reactions agree, those of the edge that is lost too."""
     moves = move("push", "left", shift=[0.01, 0, 0]), move("push", "right", shift=[-0.01, 0, 0])

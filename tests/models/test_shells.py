@@ -59,7 +59,7 @@ def test_what_is_watched() -> None:
     assert z == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+@pytest.mark.parametrize("symmetry", [pytest.param("axisymmetric", marks=pytest.mark.slow), "half"])
 def test_pressure_beside_edges_that_move(symmetry: str) -> None:
     """One of two rings is pressed while its inner edge is lifted: energy, volume and reactions as alone, 1e-9.
 

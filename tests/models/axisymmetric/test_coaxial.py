@@ -204,7 +204,7 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
         assert (pressure * area)[inside].sum() == pytest.approx(force, rel=1e-12)
 
 
-@pytest.mark.parametrize(("m", "factor"), [(1, None), (2, "1.5 - 4*(x**2 + y**2)")])
+@pytest.mark.parametrize(("m", "factor"), [(1, None), pytest.param(2, "1.5 - 4*(x**2 + y**2)", marks=pytest.mark.slow)])
 def test_waves_of_contact(m: int, factor: str | None) -> None:
     """The second variation along a wave, of half the thickness too, is that of the distances of its points in space."""
     shell, thick = ({"thickness_factor": factor}, 1.25) if factor else ({}, 1.0)

@@ -76,9 +76,9 @@ def test_all_of_a_narrow_load_is_carried():
     assert force == pytest.approx(1e-7 * over_sphere(np.ones_like, 0.02), rel=1e-3)
 
 
-@pytest.mark.parametrize("width", [0.02, 0.002])
-def test_all_of_a_narrow_potential_is_there(width: float) -> None:
+def test_all_of_a_narrow_potential_is_there() -> None:
     """Of a rigid lift its energy is that of the force on a disc: pi width². Its place is found by no symmetry."""
+    width = 0.002
     case = {
         "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
         "boundary": {"rim": "clamped"},

@@ -124,7 +124,6 @@ def test_live_pressure_between_parallel_symmetry_planes() -> None:
     assert plate.observe(last.point.state)["volume_change"] == pytest.approx(expected, rel=2e-3)
 
 
-@pytest.mark.slow
 def test_sectors_between_oblique_symmetry_planes() -> None:
     """Of a cylinder under dead pressure: one has the energy per angle of a quarter between x = 0 and y = 0."""
     loading = {"kind": "dead", "loads": [{"over": "all", "pressure": 1e-4}], "factor": 1, "points": 1}

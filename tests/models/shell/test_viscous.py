@@ -57,6 +57,7 @@ def test_damped_vibration(shell: dict[str, Any], polynomial: list[float]) -> Non
 COUPLED = {"plies": [ply(0, 3.0, 0.5, nu12=0.0), ply(90, 3.0, 0.5, nu12=0.0)]}
 
 
+@pytest.mark.slow
 def test_damped_vibration_of_plies() -> None:
     """A cantilever of [0/90]: an oscillator with the stiffness D11 - B11^2/A11 of lamination theory."""
     A, B, D = section(*COUPLED["plies"]).matrices(1.0)[:, 0]
