@@ -48,21 +48,16 @@ def made(shell: dict[str, Any], boundary: dict[str, str], **sections: Any) -> Sc
     return Scene(Case.model_validate({"shell": {"poisson_ratio": 0.3, **shell}, "boundary": boundary, **sections}))
 
 
-HALF = {**ASIDE, "position": [0.035, 0.0, -0.02]}
 KINDS = {
     "shell": lambda: made(PLATE, {"left": "clamped"}, magnetic=field([ASIDE, COIL], flux_density="20 mT", polar=30),
-                          loading=STEPS, mesh={"degree": 3, "size": 0.012}),
-    "rotation law": lambda: made(PLATE, {"left": "clamped"}, loading=STEPS, mesh={"degree": 2, "size": 0.015},
+                          loading=STEPS, mesh={"degree": 3, "size": 0.03}),
+    "rotation law": lambda: made(PLATE, {"left": "clamped"}, loading=STEPS, mesh={"degree": 2, "size": 0.03},
                                  magnetic={**field([ASIDE, COIL]), "remanence": "rotation"}),
-    "half": lambda: made({"geometry": "strip", "radius": "30 mm", "width": 0.4, "thickness": "1 mm",
-                          "youngs_modulus": "1 MPa"}, {"root": "clamped"}, symmetry="half", mesh={"degree": 3},
-                         magnetic=field([HALF, COIL]),
-                         loading=[s for s in STEPS if s.get("name") != "turn"]),
     "meridian": lambda: made(RING, {"inner": "clamped"}, symmetry="axisymmetric",
                              magnetic={**field([BELOW]), "remanent": {"kind": "radial", "flux_density": "100 mT"}},
                              loading=UP),
     "solid": lambda: made(PLATE, {"left": "clamped"}, model="solid", magnetic=field([ASIDE, COIL]), loading=STEPS,
-                          mesh={"size": 0.015}),
+                          mesh={"size": 0.03}),
 }  # fmt: skip
 
 
@@ -132,7 +127,7 @@ def _times(K: Any, v: np.ndarray) -> np.ndarray:
 
 
 def test_force_and_torque_on_a_magnetised_cap() -> None:
-    """Those of magpylib, of the magnet on the dipoles of a rigid cap: 40 x 80 of them, by Gauss's rule."""
+    """Those of magpylib, of the magnet on the dipoles of a rigid cap: 20 x 40 of them, by Gauss's rule."""
     R, h, polar, J = 25 * MM, 0.25 * MM, np.pi / 6, np.array([0.06, 0.0, 0.08])
     here = np.array([6 * MM, -3 * MM, 40 * MM])
     axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
@@ -148,18 +143,18 @@ def test_force_and_torque_on_a_magnetised_cap() -> None:
             "applied": {"sources": [magnet]},
         },
         loading=steps,
-        mesh={"degree": 4, "refinement": 0.3},
+        mesh={"degree": 3, "refinement": 0.3},
     )
     mu = {**cap.unloaded().mu, "lambda_m": cap.problem.lambda_m}
     found = cap.observe(State(cap.model.zero(), mu))
     force = [found[f"source_force_move_{k}"] for k in axes]
     torque = [found[f"source_torque_turn_{k}"] for k in axes]
 
-    s, weights = np.polynomial.legendre.leggauss(40)
+    s, weights = np.polynomial.legendre.leggauss(20)
     theta, weight = (s + 1) * polar / 2, weights * polar / 2
-    phi = 2 * np.pi * np.arange(80) / 80
+    phi = 2 * np.pi * np.arange(40) / 40
     places = R * np.array([[np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)] for t in theta for p in phi])
-    volumes = np.repeat(h * R**2 * np.sin(theta) * weight * 2 * np.pi / 80, 80)
+    volumes = np.repeat(h * R**2 * np.sin(theta) * weight * 2 * np.pi / 40, 40)
     body = [
         magpylib.misc.Dipole(moment=v * J / magpylib.mu_0, position=x) for v, x in zip(volumes, places, strict=True)
     ]
@@ -191,14 +186,13 @@ def test_newton_is_quadratic(kind: str) -> None:
 
 
 def test_models_agree() -> None:
-    """A magnet below a rigid disc, moved: meridian, half and full shell have the same force on it; a solid is thick."""
+    """A magnet below a rigid disc, moved: meridian and half shell have the same force on it; a solid is thick."""
     disc = {"geometry": "disc", "radius": "25 mm", "thickness": "0.5 mm", "youngs_modulus": "1 MPa"}
     coarse = {"mesh": {"degree": 3, "refinement": 0.5}}
     found = []
     for symmetry, sections in (
         ("axisymmetric", {}),
         ("half", coarse),
-        ("none", coarse),
         ("half", {"model": "solid", "mesh": {"refinement": 0.5}}),
     ):
         one = made(
@@ -211,5 +205,5 @@ def test_models_agree() -> None:
         )
         mu = dict.fromkeys(one.unloaded().mu, 0.5) | {"lambda_m": one.problem.lambda_m}
         found.append(one.observe(State(one.model.zero(), mu))["source_force"])
-    assert found[1:3] == pytest.approx([found[0]] * 2, rel=1e-5)
-    assert found[3] == pytest.approx(found[0], rel=2e-3)
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+    assert found[2] == pytest.approx(found[0], rel=2e-3)

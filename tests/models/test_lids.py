@@ -68,15 +68,14 @@ def test_a_tube_pulled_apart(symmetry: str) -> None:
     )
 
 
-@pytest.mark.parametrize("across", ["clamped", {"held": ["z"]}])
-def test_one_edge_of_four_has_no_lid(across: Any) -> None:
+def test_one_edge_of_four_has_no_lid() -> None:
     """Where a part of an edge moves there is nothing that could close it: the volume is what the surface sweeps."""
     plate = {"geometry": "plate", "length": 1.0, "width": 1.0, "thickness": 0.02, "youngs_modulus": 1.0}
-    sides = {"left": "clamped", "right": "clamped", "bottom": across, "top": across}
+    sides = {"left": "clamped", "right": "clamped", "bottom": {"held": ["z"]}, "top": {"held": ["z"]}}
     lifted = {}
     for names in (("right",), tuple(sides)):
         moves = (move("way", *names, shift=[0.0, 0.0, 0.01]),)
-        scene = moving_scene(moves, plate, sides, mesh={"degree": 3, "size": 0.3}, loading=PRESSED)
+        scene = moving_scene(moves, plate, sides, mesh={"degree": 3, "size": 0.5}, loading=PRESSED)
         *_, last = ms.trace(scene, "way", control="load", targets=[1.0])
         lifted[len(names)] = scene.observe(last.point.state)["volume_change"]
     assert abs(lifted[4]) < 1e-12

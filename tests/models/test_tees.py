@@ -68,10 +68,9 @@ def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
     return scene, last.point.state, scene.observe(last.point.state)
 
 
-@pytest.mark.parametrize("modulus", [1.0, 4.0])
-def test_stiffened_plate(modulus: float) -> None:
+def test_stiffened_plate() -> None:
     """F L^3/(3 EI) of the T-shaped section, 3e-3; the tip is that of the plate, not of the web at the same place."""
-    length, height = 4.0, 0.1
+    length, height, modulus = 4.0, 0.1, 4.0
     flange, web = WIDTH * h, modulus * height * h
     axis = web * height / 2 / (flange + web)
     EI = WIDTH * D + flange * axis**2 + web * height**2 / 12 + web * (height / 2 - axis) ** 2
@@ -79,7 +78,7 @@ def test_stiffened_plate(modulus: float) -> None:
     assert seen["base_tip_uz"] == pytest.approx(1e-9 * length**3 / (3 * EI), rel=3e-3)
 
 
-@pytest.mark.parametrize("height", [0.1, -0.1])
+@pytest.mark.parametrize("height", [0.1, pytest.param(-0.1, marks=pytest.mark.slow)])
 def test_a_mesh_file_in_which_edges_have_three_triangles(tmp_path: Path, height: float) -> None:
     """The same plate, read: the beam's deflection, 3e-3; with a web on both sides too, as an edge with four."""
     length, parts = 4.0, (16, 2)

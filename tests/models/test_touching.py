@@ -66,7 +66,7 @@ def flattened(
     return model.system.held((u.ravel() + noise * h * rough)[: model.system.size])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_derivatives(seed: int) -> None:
     """Central differences of the energy and of the forces at a rough state, some points open: 1e-6.
 
@@ -122,7 +122,7 @@ def test_states_with_the_same_cuts_share_a_pattern() -> None:
 
 @pytest.mark.parametrize(
     ("law", "across", "factor"),
-    [("koiter", 1, None), ("neo-hookean", 1, None), ("neo-hookean", 0, None), ("koiter", 1, "1 + 0.1*x + y**2/9")],
+    [("neo-hookean", 0, None), ("koiter", 1, "1 + 0.1*x + y**2/9")],
 )
 def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> None:
     """Walls that meet in the plane, or are pressed together across it: the energy and its variations, also by
@@ -203,12 +203,12 @@ def test_nearest_places() -> None:
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
 
 
-@pytest.mark.parametrize("thickness", [0.036, 0.024])
-def test_the_least_gap_of_shells_that_are_apart(thickness: float) -> None:
+@pytest.mark.slow
+def test_the_least_gap_of_shells_that_are_apart() -> None:
     """As of the search for all places within the reach, in few of these; with the images of a
     sector."""
     cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "poisson_ratio": 0.3, "youngs_modulus": 1}
-    lower, upper = ({"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, thickness))
+    lower, upper = ({"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, 0.024))
     shells = {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}}
     loading = {"kind": "dead", "loads": [{"edge": "upper.hole", "force": [0, 0, -1]}], "until": "target", "factor": 1}
     case = {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": 0.08, "degree": 3}, "loading": loading}
@@ -228,7 +228,7 @@ def test_the_least_gap_of_shells_that_are_apart(thickness: float) -> None:
     assert at.of(term.least_gap) == pytest.approx(nearest[0].min() - term._h, abs=1e-13)
 
 
-@pytest.mark.parametrize("deep", [1e-4, 3e-3, 0.2])
+@pytest.mark.parametrize("deep", [3e-3, 0.2])
 def test_folds_between_cells_have_no_jump(deep: float) -> None:
     """On large cells some points are opposite a side, where their nearest place changes cells: differences 1e-6."""
     thick = {**RING["shell"], "thickness": 0.08}

@@ -1,6 +1,7 @@
 """Meridian models that several tests share, and their paths up to the axisymmetric instability."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from conftest import spherical
@@ -78,6 +79,13 @@ def dimpled(R_over_h: float, lambda_m: float) -> MeridianModel:
     """The paper's dimple under pressure, nu = 0.5."""
     loads = Loads(pressure=True, magnetic=ALONG_AXIS if lambda_m else None)
     return hemisphere(R_over_h, 0.5, loads, dimple=DIMPLE)
+
+
+@cache
+def buckled(R_over_h: float, lambda_m: float) -> tuple[MeridianModel, Buckling]:
+    """Return the model of the dimple and its buckling, once in a process."""
+    model = dimpled(R_over_h, lambda_m)
+    return model, buckle(model, lambda_m)
 
 
 def indent(model: MeridianModel, depths: list[float]) -> list[float]:

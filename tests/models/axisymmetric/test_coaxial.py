@@ -66,6 +66,7 @@ def test_far_apart() -> None:
         assert (value, label) == (pytest.approx(own, rel=1e-8), its_label)
 
 
+@pytest.mark.slow
 def test_pair_in_a_field() -> None:
     """Tops and volume as of halves of both, whose mesh converges to that: 1e-3 (3.7e-3 on elements of 0.15)."""
     lower = cap() | {"remanent": {"kind": "radial"}, "points": {"top": [0, 0, 1]}}
@@ -187,7 +188,9 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
     tube = {"shell": tube, "boundary": {"bottom": "clamped"}}
     shells = {"disc": disc, "tube": tube | {"place": {"position": [0, 0, top - 0.1]}}}
     data = {"shells": shells, "contact": [["disc", "tube"]], "symmetry": symmetry, "loading": PRESSURE}
-    scene = Scene(Case.from_source(data | {"mesh": {"degree": 2, "size": 0.04}}))
+    scene = Scene(
+        Case.from_source(data | {"mesh": {"degree": 2, "size": 0.04 if symmetry == "axisymmetric" else 0.06}})
+    )
     model = scene.model
     u = np.zeros((model.system.size // model.V.dofmap.bs, model.V.dofmap.bs))
     of_shells = model.meridian.patches if model.axisymmetric else model.midsurface.patches
@@ -201,7 +204,7 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
         assert (pressure * area)[inside].sum() == pytest.approx(force, rel=1e-12)
 
 
-@pytest.mark.parametrize(("m", "factor"), [(1, None), (2, None), (2, "1.5 - 4*(x**2 + y**2)")])
+@pytest.mark.parametrize(("m", "factor"), [(1, None), pytest.param(2, "1.5 - 4*(x**2 + y**2)", marks=pytest.mark.slow)])
 def test_waves_of_contact(m: int, factor: str | None) -> None:
     """The second variation along a wave, of half the thickness too, is that of the distances of its points in space."""
     shell, thick = ({"thickness_factor": factor}, 1.25) if factor else ({}, 1.0)
@@ -267,9 +270,9 @@ def test_messages() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "top"), [("1", 1.0), ("1.3 - 4*(1 - z)", 1.3)])
-def test_two_caps_are_one_on_a_plane(factor: str, top: float) -> None:
-    """Pressed pole to pole each is as one on a rigid plane: F at one thickness to 1e-3; also of tapered ones."""
+def test_two_caps_are_one_on_a_plane() -> None:
+    """Tapered ones, pressed pole to pole: each is as one on a rigid plane, F at one thickness to 1e-3."""
+    factor, top = "1.3 - 4*(1 - z)", 1.3
 
     def moved(**moves: float) -> dict[str, Any]:
         moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
@@ -302,6 +305,7 @@ def test_ridges_that_are_highest_between_nodes() -> None:
     assert scene.model.system.at(scene.unloaded()).of(touching.least_gap) == pytest.approx(0.2 * 0.03, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_wave_that_comes_and_goes_in_contact() -> None:
     """Pressed domes tilt (m = 1) in a window with a point of the path, where 100 loads find it on this mesh."""
     dome = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.015, "poisson_ratio": 0.3}

@@ -27,7 +27,6 @@ def displacement(phi: Array) -> tuple[Array, Array]:
 @pytest.mark.parametrize(
     "field",
     [
-        Magnetisation(E3, E3, "second"),
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
         Magnetisation(WithinRims(((REACH.inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),

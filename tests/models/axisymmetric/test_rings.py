@@ -15,7 +15,7 @@ MATERIAL = {"thickness": 0.02, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
 ANNULUS = {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, **MATERIAL}
 CYLINDER = {"geometry": "cylinder", "radius": 1.0, "length": 0.8, **MATERIAL}
 BULGE = {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "tube": [-60, 60], **MATERIAL}
-HOLED = {"geometry": "cap", "radius": 1.0, "polar": 60, "hole": 20, **MATERIAL}
+HOLED = {"geometry": "cap", "radius": 1.0, "polar": 40, "hole": 20, **MATERIAL}
 VASE = {"geometry": "revolution", "profile": {"points": [[1.0, 0.0], [0.8, 0.4], [0.9, 0.8]]}, **MATERIAL}
 EVERYWHERE = {"over": "all", "pressure": 2e-6}
 
@@ -70,17 +70,15 @@ PROBLEMS: dict[str, dict[str, Any]] = {
 }
 
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.02, "points": 1}
-PROBLEMS |= {
-    f"tube under pressure, top {name}": {
-        "shell": CYLINDER,
-        "boundary": {"bottom": "clamped", "top": top},
-        "points": {"A": [0, 1, 0.4]},
-        "loading": PRESSED,
-    }
-    for name, top in {"sliding": {"held": ["x", "y"]}, "in a plane": "symmetry", "free": "free"}.items()
+PROBLEMS["tube under pressure, top in a plane"] = {
+    "shell": CYLINDER,
+    "boundary": {"bottom": "clamped", "top": "symmetry"},
+    "points": {"A": [0, 1, 0.4]},
+    "loading": PRESSED,
 }
 
 FINER = {
+    "part of a torus": 0.18,
     "cap with a hole in a field": 0.1,
     "vase of varying thickness": 0.09,
     "tube under pressure, top in a plane": 0.12,
@@ -100,12 +98,15 @@ def first_wave(problem: dict[str, Any], **mesh: float) -> tuple[str, float]:
     return found.mode, next(iter(found.point.state.mu.values()))
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+SLOW = {"vase of varying thickness", "tube under pressure, top in a plane"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in PROBLEMS])
 def test_meridian_and_triangles(name: str) -> None:
     """To the error of the triangles, which falls with the fourth power of their size: see FINER."""
     scene, line = ended(PROBLEMS[name], "auto", {"degree": 3})
     assert scene.problem.axisymmetric
-    _, half = ended(PROBLEMS[name], "half", {"degree": 3, "size": FINER.get(name, 0.18)})
+    _, half = ended(PROBLEMS[name], "half", {"degree": 3, "size": FINER.get(name, 0.25)})
     for column in ("energy", "volume_change", "w_over_h", "w_pole_over_h", "A_uy", "A_uz"):
         assert line[column] == pytest.approx(half[column], rel=5e-3, abs=1e-15), column
 
@@ -174,10 +175,9 @@ def test_waves_of_a_hinged_cylinder() -> None:
     assert factor * 1e-5 == pytest.approx(pressure(critical), rel=2e-2)
 
 
-WAVY: list[tuple[dict[str, Any], dict[str, Any]]] = [
+WAVY: list[Any] = [
     ({"bottom": "clamped", "top": "clamped"}, {"kind": "pressure"}),
-    ({"bottom": "clamped", "top": {"held": ["x", "y"]}}, {"kind": "pressure"}),
-    ({"bottom": "clamped", "top": "free"}, {"kind": "pressure"}),
+    pytest.param({"bottom": "clamped", "top": "free"}, {"kind": "pressure"}, marks=pytest.mark.slow),
     ({"bottom": "clamped"}, {"kind": "dead", "loads": [{"edge": "top", "moment": 1e-5}]}),
 ]
 

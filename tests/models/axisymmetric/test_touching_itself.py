@@ -77,7 +77,6 @@ def test_derivatives_of_rubber(lower: dict[str, Any], upper: dict[str, Any], z: 
     check_derivatives(scene, stretched(scene, down), (0.02 * h, 0.9 * h), h, far=10.0)
 
 
-@pytest.mark.slow
 def test_derivatives_of_what_has_grown() -> None:
     """Energy and forces by the natural stretch, of fourth order: 1e-6."""
     load = [{"kind": "natural", "stretch": 1}, PRESSURE]

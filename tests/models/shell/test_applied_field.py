@@ -39,7 +39,6 @@ def shell(field: Magnetisation) -> ShellModel:
     return ShellModel(hemisphere(0.8), MATERIAL, 2, {}, Loads(magnetic=field))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_linear_field_is_that_of_its_gradient(law: RemanenceLaw) -> None:
     """Energies, residuals and tangents to 1e-12, at a pattern; the second displacement after the first."""
@@ -59,7 +58,6 @@ def test_linear_field_is_that_of_its_gradient(law: RemanenceLaw) -> None:
         assert abs(magnetic[0] - magnetic[1]).max() <= 1e-10 * abs(magnetic[1]).max()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_derivatives_in_a_field_of_a_dipole(law: RemanenceLaw) -> None:
     """Points against forms, and these against finite differences: the field is not a polynomial."""

@@ -31,7 +31,6 @@ TERMS = [
     "Utau",
     "couple",
 ]
-DEGREES = [2, pytest.param(5, marks=pytest.mark.slow)]
 
 
 def alone(model: ShellModel, name: str) -> FiniteElementSystem:
@@ -51,11 +50,10 @@ def test_term_alone(shell: Shells, name: str) -> None:
     check(alone(model, name), u, {"lambda_m": 1.0, "pressure": 1.0})
 
 
-@pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("half", [False, True])
-def test_terms_together(shell: Shells, degree: int, half: bool) -> None:
-    model = shell(degree, half=half)
-    u = random_displacement(model, 2e-3 / degree**2)
+def test_terms_together(shell: Shells, half: bool) -> None:
+    model = shell(2, half=half)
+    u = random_displacement(model, 5e-4)
     u[model.system._fixed] = 0
     check(model.system, u, {"lambda_m": 0.02, "pressure": 0.3})
 

@@ -1,4 +1,4 @@
-"""One's own energies on a named edge: closed forms on mid-surface, meridian and half, and what is refused."""
+"""One's own energies on a named edge: closed forms on meridian and half, and what is refused."""
 
 from typing import Any
 
@@ -22,7 +22,6 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.shell import ShellModel
 
 H, NU = 0.02, 0.3
-MODELS = ["axisymmetric", "half", "none"]
 
 
 def pull(r0: Jet, u: Jet, edge: Edge) -> Expr:
@@ -42,19 +41,18 @@ def hinge(r0: Jet, u: Jet, edge: Edge) -> Expr:
 
 def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any) -> dict[str, float]:
     """What is observed at a small load of one amplitude."""
-    data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.7}, **sections}
+    data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.5}, **sections}
     scene = ms.Scene(ms.Case.from_source(Source("test", data)), terms=terms)
     *_, end = ms.trace(scene, amplitude, targets=[target])
     return scene.observe(end.point.state)
 
 
-@pytest.mark.parametrize("symmetry", MODELS)
-def test_ring_around_a_flat_ring_that_is_pulled(symmetry: str) -> None:
-    """Lamé: u = A r + B/r, held at r = a, with the pull q less the ring's force EA u/R² at r = R."""
+def test_ring_around_a_flat_ring_that_is_pulled() -> None:
+    """On its meridian. Lamé: u = A r + B/r, held at r = a, with the pull q less the ring's force EA u/R² at r = R."""
     a, q, EA = 0.5, 1e-6, 0.7
     outward = ms.OwnTerm("pull", pull, on="outer", observed={"spread": lambda r0, u, edge: -pull(r0, u, edge)})
     found = loaded(
-        symmetry,
+        "axisymmetric",
         "pull",
         q,
         outward,
@@ -67,12 +65,11 @@ def test_ring_around_a_flat_ring_that_is_pulled(symmetry: str) -> None:
     assert found["spread"] / q == pytest.approx(2 * np.pi * u, rel=2e-5)
 
 
-@pytest.mark.parametrize("symmetry", MODELS)
-def test_plate_on_an_elastic_hinge(symmetry: str) -> None:
-    """Timoshenko, Theory of Plates and Shells, section 15: between the simply supported and the clamped plate."""
+def test_plate_on_an_elastic_hinge() -> None:
+    """On a half. Timoshenko, Plates and Shells, section 15: between a simply supported and a clamped plate."""
     D, K, p = H**2 / (12 * (1 - NU**2)), 2.0, 1e-6
     found = loaded(
-        symmetry,
+        "half",
         "pressure",
         p,
         ms.OwnTerm("hinge", hinge, on="rim", value=K * D),
@@ -84,7 +81,7 @@ def test_plate_on_an_elastic_hinge(symmetry: str) -> None:
     assert found["w_pole_over_h"] * H == pytest.approx(load / (64 * D) * (5 + NU + K) / (1 + NU + K), rel=2e-4)
 
 
-@pytest.mark.parametrize("density", [pull, ring, hinge])
+@pytest.mark.parametrize("density", [ring, hinge])
 def test_residual_and_tangent(density: Any) -> None:
     """Of the point derivatives against those of the forms."""
     loads = Loads(pressure=True, own=(ms.OwnTerm("own", density, on="rim"),))
@@ -99,9 +96,8 @@ def test_symmetry() -> None:
     sided = Mirror(np.array([1.0, 0.0, 0.0]), 0.5, {"right": "left"})
     assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
     assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)
-    for density in (pull, ring, hinge):
-        term = ms.OwnTerm("own", density, on="rim")
-        assert (term.turns, term.mirrored(Y0)) == (True, True)
+    around = ms.OwnTerm("own", ring, on="rim")
+    assert (around.turns, around.mirrored(Y0)) == (True, True)
     along = ms.OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.along, u.r), on="rim")
     assert (along.turns, along.mirrored(Y0)) == (True, False)
 

@@ -27,7 +27,7 @@ from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.follow import follow
 
 Shells = Callable[..., ShellModel]
-DEGREES = [2, pytest.param(5, marks=pytest.mark.slow)]
+DEGREES = [2, 5]
 TERMS = {
     "membrane": "full",
     "bending": "full",

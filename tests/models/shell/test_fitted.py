@@ -53,27 +53,32 @@ def dead(load, **mesh):
 
 
 @pytest.mark.parametrize(
-    ("load", "of", "radius"),
+    ("load", "of", "radius", "mesh"),
     [
-        (disc(0.02), np.ones_like, 0.02),
-        (disc(0.05), np.ones_like, 0.05),
-        (f"exp(-3000*({AWAY}))", lambda r: np.exp(-3000 * r**2), 0.12),
-        (disc(0.004), np.ones_like, 0.004),
-        (disc(0.001), np.ones_like, 0.001),
-        (f"exp(-({AWAY})/0.002**2)", lambda r: np.exp(-(r**2) / 0.002**2), 0.012),
+        (f"exp(-3000*({AWAY}))", lambda r: np.exp(-3000 * r**2), 0.12, {}),
+        (disc(0.001), np.ones_like, 0.001, {"size": 0.4}),
+        (f"exp(-({AWAY})/0.002**2)", lambda r: np.exp(-(r**2) / 0.002**2), 0.012, {"size": 0.4}),
     ],
 )
-@pytest.mark.parametrize("mesh", [{}, {"size": 0.4}])
-def test_all_of_a_narrow_load_is_carried(load, of, radius, mesh):
+def test_all_of_a_narrow_load_is_there(load, of, radius, mesh):
+    """Its resultant, on elements that are as small as it and on large ones."""
     scene = Scene(dead(load, **mesh))
+    column = scene.model.system.load(scene.model.zero(), scene.unloaded().mu, "load").reshape(-1, 3)
+    assert -0.01 * column[:, 2].sum() == pytest.approx(-1e-7 * over_sphere(of, radius), rel=1e-3)  # times E h R
+
+
+@pytest.mark.slow
+def test_all_of_a_narrow_load_is_carried():
+    """By the rim."""
+    scene = Scene(dead(disc(0.02)))
     end = list(follow(scene))[-1]
     force = scene.observe(end.point.state)["rim_fz"]
-    assert force == pytest.approx(1e-7 * over_sphere(of, radius), rel=1e-3)
+    assert force == pytest.approx(1e-7 * over_sphere(np.ones_like, 0.02), rel=1e-3)
 
 
-@pytest.mark.parametrize("width", [0.02, 0.002])
-def test_all_of_a_narrow_potential_is_there(width: float) -> None:
+def test_all_of_a_narrow_potential_is_there() -> None:
     """Of a rigid lift its energy is that of the force on a disc: pi width². Its place is found by no symmetry."""
+    width = 0.002
     case = {
         "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
         "boundary": {"rim": "clamped"},
@@ -126,6 +131,7 @@ def test_a_narrow_imperfection_has_few_cells():
     assert problem.size(np.array([0.34, 0.25])) < 0.04
 
 
+@pytest.mark.slow
 def test_a_mesh_that_does_not_show_a_formula_says_so():
     assert "warning: loading.loads.0.per_area: varies within elements" in describe(dead(disc(0.05), size=0.4))
     assert "warning" not in describe(dead(disc(0.05)))
@@ -173,7 +179,7 @@ def test_a_thickness_that_jumps_in_elements_says_what_that_costs():
 
 @pytest.mark.parametrize(
     ("factor", "break_at"),
-    [("1.5-0.5*sign(x-0.53)", 0.53), ("1-0.5*exp(-((x-0.05)/0.01)**2)", 0.05), ("1-0.5*exp(-((x-0.3)/0.01)**2)", 0.3)],
+    [("1.5-0.5*sign(x-0.53)", 0.53), ("1-0.5*exp(-((x-0.05)/0.01)**2)", 0.05)],
 )
 def test_the_stiffness_that_is_lost_is_said_within_a_factor_of_two(factor: str, break_at: float) -> None:
     """A cantilever under a force at its tip, against the integral of (1 - x)^2/t^3."""

@@ -21,11 +21,10 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * W + (1 - np.cos(angle)) * W @ W
 
 
-@pytest.mark.parametrize("degree", [2, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("angle", [0.3, 2.5])
-def test_rigid_motion_costs_nothing(shell: Shells, degree: int, angle: float) -> None:
+def test_rigid_motion_costs_nothing(shell: Shells, angle: float) -> None:
     """Every elastic term stays below 1e-20 of the membrane energy of a 1 % stretch."""
-    model = shell(degree, held=False)
+    model = shell(2, held=False)
     r0 = model.r0.x.array.reshape(-1, 3)
     stretch = model.system.energies(0.01 * r0.ravel())["membrane"]
     Q = rotation(np.array([0.3, -0.5, 0.8]), angle)

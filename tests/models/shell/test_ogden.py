@@ -94,7 +94,6 @@ def test_small_strains_are_koiters(law: Ogden) -> None:
         assert np.diff(np.log(off)) / np.diff(np.log(sizes)) == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stretch", [0.0, 0.3])
 def test_residual_and_tangent(stretch: float) -> None:
     """By differences of the energy: about no stretch, where both are equal, and about 1.3."""

@@ -77,8 +77,15 @@ def work(of: ms.Scene, u: Array, v: Array) -> float:
     return unit * fem.assemble_scalar(fem.form(ufl.dot(w, ufl.cross(a1, a2)) / ufl.sqrt(ufl.dot(area, area)) * dx))
 
 
-@pytest.mark.parametrize(("model", "symmetry"), MODELS)
-@pytest.mark.parametrize(("top", "potential"), EDGES)
+@pytest.mark.parametrize(
+    ("top", "potential", "model", "symmetry"),
+    [  # the edge that is held along e3 alone on half and meridian, the free one on all
+        (*edge, *model)
+        for edge in EDGES
+        for model in MODELS
+        if edge[0] == FREE or model[1] == "axisymmetric" or (edge[0] == FLAT) == (model == ("shell", "half"))
+    ],
+)
 def test_virtual_work_and_tangent(top: Any, potential: bool, model: str, symmetry: str) -> None:
     """The load is the integral of n . v, its tangent the difference of it, symmetric where there is a potential."""
     tube = cylinder(top, model, symmetry)
@@ -139,6 +146,7 @@ def elastica(q: float) -> Array:
     return np.asarray(y[4:, -1] - [1, 0])
 
 
+@pytest.mark.slow
 def test_strip_under_pressure() -> None:
     """Clamped at one end, its tip turned by 89 degrees, against the elastica; at most ten iterations a step."""
     h, q = 1e-3, 10.0

@@ -52,15 +52,13 @@ def orders(sizes: list[float], degree: int) -> tuple[np.ndarray, np.ndarray]:
     return errors, np.log(errors[:-1] / errors[1:]) / np.log(np.divide(sizes[:-1], sizes[1:]))[:, None]
 
 
-@pytest.mark.parametrize(("size", "degree"), [(0.2, 3), (0.4, 4)])
-def test_deflection(size: float, degree: int) -> None:
-    assert solve(size, degree)[0] < 1e-4
+def test_deflection() -> None:
+    assert solve(0.4, 4)[0] < 1e-4
 
 
-@pytest.mark.parametrize("degree", [3, 4])
-def test_simply_supported_edge(degree: int) -> None:
+def test_simply_supported_edge() -> None:
     """w0 = (5 + nu)/(64 (1 + nu)) p R^4/D: Timoshenko, art. 17; no bending term acts at the edge."""
-    model = ShellModel(disc(0.2), MATERIAL, degree, {"rim": "simply supported"}, Loads(pressure=True))
+    model = ShellModel(disc(0.2), MATERIAL, 3, {"rim": "simply supported"}, Loads(pressure=True))
     h, nu, D = MATERIAL.h, MATERIAL.nu, MATERIAL.bending_stiffness * MATERIAL.h
     p = 1e-4 * h * 64 * D * (1 + nu) / (5 + nu)
     start = State(model.zero(), {"pressure": 0.0})
@@ -70,15 +68,14 @@ def test_simply_supported_edge(degree: int) -> None:
     assert model.deflection(found.state.u, "pole") == pytest.approx(1e-4 * h, rel=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("degree", [2, 3, 4])
+@pytest.mark.parametrize("degree", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_order_of_convergence(degree: int) -> None:
     """O(h^(k-1)) in the energy norm (Brenner and Sung, J. Sci. Comput. 22, 2005).
 
     The deflection at the centre converges at least as h^2, h^(2k-2), h^4: the last is the order of the cubic rim.
     """
-    errors, order = orders([0.4, 0.2, 0.1, 0.05], degree)
-    overall = np.log(errors[0] / errors[-1]) / np.log(8)
+    errors, order = orders([0.4, 0.2, 0.1], degree)
+    overall = np.log(errors[0] / errors[-1]) / np.log(4)
     assert overall[1] == pytest.approx(degree - 1, abs=0.1 if degree == 2 else 0.5)
     assert order[-1, 1] > degree - 1 - 0.15
     assert overall[0] > {2: 1.9, 3: 3.5, 4: 3.9}[degree]

@@ -64,9 +64,9 @@ def test_moment_is_that_of_the_body_to_the_order_of_the_square(s: float, share: 
     assert np.log2(less[:-1] / less[1:]) == pytest.approx([1.90, 1.97, 1.99], abs=0.01)
 
 
-@pytest.mark.parametrize("thin", [5, 10])
-def test_a_run_rolls_it_up(thin: int) -> None:
+def test_a_run_rolls_it_up() -> None:
     """By the moment of a body of that R/h, to the shell's own curvature; the sides are mirrors."""
+    thin = 10
     M = moment(block(1.0, 0.0), 1 / (thin * H))
     case = Case.model_validate(
         {
@@ -77,7 +77,7 @@ def test_a_run_rolls_it_up(thin: int) -> None:
             "boundary": {"root": "clamped", "sides": "symmetry"},
             "points": {"tip": ["1 m", "0 m", "0 m"]},
             "mesh": {"degree": 3, "refinement": 0.5},
-            "loading": {"kind": "dead", "loads": [{"edge": "tip", "moment": f"{M} N"}], "factor": 1, "points": 4},
+            "loading": {"kind": "dead", "loads": [{"edge": "tip", "moment": f"{M} N"}], "factor": 1, "points": 2},
         }
     )  # fmt: skip
     tip = run(case).rows[-1]

@@ -97,7 +97,6 @@ def test_each_order_alone(energy: Callable[[MagneticEnergy, float], float]) -> N
 FIELD = replace(TILTED, gradient=G, across=(np.array([1.0, 0.0, 0.0]),), law="rotation")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["full", "second_consistent"])
 def test_derivatives(kind: MagneticEnergy) -> None:
     """Of each term, at a pattern: points against forms, and these against finite differences."""
@@ -120,10 +119,8 @@ def test_tangent_changes_with_each_amplitude(amplitude: str) -> None:
     assert abs(norms[1] / norms[0] - 1) > 1e-6
 
 
-@pytest.mark.parametrize("name", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau"])
+@pytest.mark.parametrize("name", ["magnetic", "magnetic_torque"])
 def test_symmetry(name: str) -> None:
-    """That of the other law: fields along e3 turn and mirror, in the plane y = 0 they mirror, across it they do not."""
-    of, E1, E2 = getattr(laws, name), *np.eye(3)[:2]
-    for Br, Ba, turns, mirrors in ((E3, E3, True, True), (E3, E1 + E3, False, True), (E3, E2 + E3, False, False)):
-        term = OwnTerm("own", of, (Br, Ba))
-        assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
+    """That of the other law: fields in the plane y = 0 mirror and do not turn."""
+    term = OwnTerm("own", getattr(laws, name), (E3, np.eye(3)[0] + E3))
+    assert (term.turns, term.mirrored(Y0)) == (False, True)

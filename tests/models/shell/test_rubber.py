@@ -97,7 +97,6 @@ def shell(share: float, *, half: bool = False, natural: bool = False, varies: bo
     return ShellModel(surface, Material(0.5, 0.05, share), 2, edges, loads, thickness=thickness)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [{}, {"half": True}, {"natural": True, "varies": True}])
 def test_residual_and_tangent(kind: dict[str, bool]) -> None:
     """By differences of the energy, and against FFCx's forms: interior, clamped and mirror edges too."""
@@ -108,7 +107,6 @@ def test_residual_and_tangent(kind: dict[str, bool]) -> None:
     assert difference(model.system, u, mu) <= 1e-12
 
 
-@pytest.mark.slow
 def test_modes_that_a_half_excludes() -> None:
     model = shell(0.2, half=True)
     modes = model.excluded_modes

@@ -88,6 +88,7 @@ def pressed(shell: dict[str, Any], boundary: dict[str, Any]) -> Case:
     )
 
 
+@pytest.mark.slow
 def test_live_pressure_beside_a_symmetry_plane_anywhere() -> None:
     """Half of a plate of twice the length, held at x = 0 or beside x = 1: volumes are measured from that plane."""
     found = []
@@ -123,18 +124,17 @@ def test_live_pressure_between_parallel_symmetry_planes() -> None:
     assert plate.observe(last.point.state)["volume_change"] == pytest.approx(expected, rel=2e-3)
 
 
-@pytest.mark.slow
 def test_sectors_between_oblique_symmetry_planes() -> None:
-    """Of a cylinder under dead pressure: all have the energy per angle of a quarter between x = 0 and y = 0."""
+    """Of a cylinder under dead pressure: one has the energy per angle of a quarter between x = 0 and y = 0."""
     loading = {"kind": "dead", "loads": [{"over": "all", "pressure": 1e-4}], "factor": 1, "points": 1}
     edges = {"left": "symmetry", "right": "symmetry", "bottom": "clamped", "top": "clamped"}
     found = []
-    for first, last in ((0, 90), (0, 60), (-25, 35)):
+    for first, last in ((0, 90), (-25, 35)):
         shell = {**CYLINDER, "youngs_modulus": 1, "azimuth": [first, last]}
-        data = {"shell": shell, "boundary": edges, "loading": loading, "mesh": {"degree": 3, "size": 0.2618}}
+        data = {"shell": shell, "boundary": edges, "loading": loading, "mesh": {"degree": 2, "size": 0.5236}}
         *_, end = follow(sector := Scene(Case.from_source(Source("test", {**data, "symmetry": "none"}))))
         found.append(sector.observe(end.point.state)["energy"] / (last - first))
-    assert found[1:] == pytest.approx([found[0]] * 2, rel=1e-9)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 def test_a_remanence_without_value_is_refused() -> None:

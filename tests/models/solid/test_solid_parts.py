@@ -48,23 +48,18 @@ def dead(*loads: dict[str, Any]) -> dict[str, Any]:
 
 
 BENDING: list[dict[str, Any]] = [
-    {"edge": "right", "force": [0, 0, 2e-6]},
-    {"edge": "right", "per_length": [0, 0, 1e-5]},
     {"edge": "right", "moment": 1e-5},
-    {"at": "A", "force": [0, 0, 2e-6]},
-    {"over": "all", "per_area": [0, 0, 1e-5]},
     {"over": "all", "pressure": -1e-5},
 ]
 
 
 @pytest.mark.parametrize("load", BENDING)
 def test_a_strip_under_dead_loads(load: dict[str, Any]) -> None:
-    """Bent by 0.1 to 1 rad: as its shell to 2.5 %; a force at a point, whose patch ends at the edge, to 10 %."""
+    """Bent by 0.1 to 1 rad: as its shell to 2.5 %."""
     shell, solid = (end(m, STRIP, boundary=CLAMPED, points=TIP, loading=dead(load)) for m in ("shell", "solid"))
     assert abs(shell["A_uz"]) > 0.1
-    apart = 2 * H if "at" in load else H / 2
     for column in ("A_ux", "A_uz", "w_over_h", "energy"):
-        assert solid[column] == pytest.approx(shell[column], rel=apart)
+        assert solid[column] == pytest.approx(shell[column], rel=H / 2)
 
 
 def resultant(model: SolidModel, rigid: np.ndarray) -> float:
@@ -145,6 +140,7 @@ def test_mirror_planes_of_the_case() -> None:
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1, "points": 1}
 
 
+@pytest.mark.slow
 def test_skew_mirror_planes() -> None:
     """A sector of a cylinder between planes at 25 and 85 degrees moves as the one between 0 and 60."""
     given = {"boundary": {"left": "symmetry", "right": "symmetry", "bottom": "hinged", "top": "clamped"}}
@@ -156,8 +152,8 @@ def test_skew_mirror_planes() -> None:
         assert skew[column] == pytest.approx(straight[column], rel=1e-6)
 
 
-@pytest.mark.parametrize("end_of", ["clamped", "hinged"])
-def test_volume_beside_a_mirror_plane_away_from_the_origin(end_of: str) -> None:
+@pytest.mark.slow
+def test_volume_beside_a_mirror_plane_away_from_the_origin() -> None:
     """Pressed, with the mirror plane at the top as with it at the bottom, to the triangles' diagonals."""
     sides = {"left": "symmetry", "right": "symmetry"}
     below, above = (
@@ -165,7 +161,7 @@ def test_volume_beside_a_mirror_plane_away_from_the_origin(end_of: str) -> None:
             "solid",
             {**CYLINDER, "azimuth": [0, 45]},
             0.2,
-            boundary={**sides, plane: "symmetry", other: end_of},
+            boundary={**sides, plane: "symmetry", other: "hinged"},
             loading=PRESSED,
         )
         for plane, other in (("bottom", "top"), ("top", "bottom"))
@@ -190,6 +186,7 @@ def test_a_foundation_under_the_outer_face() -> None:
     assert solid["A_uz"] == pytest.approx(shell["A_uz"], rel=H / 2)
 
 
+@pytest.mark.slow
 def test_a_closed_cylinder_dented_at_a_named_point() -> None:
     """The chart's seam is no slit: by h from the shell, as the patch is on the outer face."""
     loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 0.5, "points": 1, "patch": 2}
@@ -198,15 +195,9 @@ def test_a_closed_cylinder_dented_at_a_named_point() -> None:
     assert solid["force"] == pytest.approx(shell["force"], rel=H)
 
 
-@pytest.mark.parametrize(
-    "remanent",
-    [
-        {"kind": "radial"},
-        {"kind": "expression", "components": ["sin(2*pi*x)", "0", "cos(2*pi*x)"]},
-    ],
-)
-def test_a_remanence_that_varies_in_a_field_with_a_gradient(remanent: dict[str, Any]) -> None:
+def test_a_remanence_that_varies_in_a_field_with_a_gradient() -> None:
     """A strip bent by up to 0.4 rad: as its shell."""
+    remanent = {"kind": "expression", "components": ["sin(2*pi*x)", "0", "cos(2*pi*x)"]}
     gradient = [[1, 0, 0], [0, 0, 0], [0, 0, -1]]
     magnetic = {"lambda_m": 2e-4, "remanent": remanent, "applied": {"polar": 60, "gradient": gradient}}
     shell, solid = (end(m, STRIP, boundary=CLAMPED, points=TIP, magnetic=magnetic) for m in ("shell", "solid"))

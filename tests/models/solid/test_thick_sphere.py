@@ -59,12 +59,9 @@ def radial(material: MooneyRivlin, pressure: float) -> tuple[float, float]:
     return float(found.y[0, 0] - inner), float(found.y[0, -1] - outer)
 
 
-@pytest.mark.parametrize(
-    ("bulk_to_shear", "share"), [(100.0, 0.0), (100.0, 0.6), pytest.param(1000.0, 0.0, marks=pytest.mark.slow)]
-)
-def test_inflation(bulk_to_shear: float, share: float) -> None:
+def test_inflation() -> None:
     """Drawn outwards until the inner radius has grown by an eighth: each face to 1e-3 of its displacement."""
-    material, pressure = MooneyRivlin.of(0.5, bulk_to_shear, share), -0.1
+    material, pressure = MooneyRivlin.of(0.5, 100.0, 0.6), -0.1
     body = hemisphere(0.35, THICKNESS, layers=2, half=True)
     model = SolidModel(body, Material(0.5, THICKNESS), material, {}, Loads())
     factory = TermFactory(body, model.u, material, THICKNESS, model.kernels)
