@@ -24,7 +24,7 @@ from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
 
 
 def coarse() -> Path:
-    """The case "arch_boundary.yaml" with elements of twice the size, in a folder that is removed as the process ends."""
+    """The case "arch_boundary.yaml" with larger elements, in a folder that is removed as the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="arch"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     text = (CASES / "arch_boundary.yaml").read_text(encoding="utf-8")
