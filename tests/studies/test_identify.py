@@ -141,6 +141,7 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
     assert again.content["evaluations"] == whole.content["evaluations"] - len(kept)
 
 
+@pytest.mark.slow
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
     """Buckling pressures in two fields say modulus and remanence of a cap, without noise exactly."""
     text = CAP + "symmetry: axisymmetric\n"
@@ -348,6 +349,7 @@ def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
     assert above.units == {"x": None, "y": "mm"}
 
 
+@pytest.mark.slow
 def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
     """What is nan or empty is said in the output and in identify.json, by column; the band is that of
     the table without these rows."""
@@ -364,6 +366,7 @@ def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
     assert found["some"]["parameters"] == found["all"]["parameters"]
 
 
+@pytest.mark.slow
 def test_one_datum_says_no_noise(tmp_path: Path) -> None:
     """With a wide prior the fit would follow it, and the band were a point."""
     data = data_file(tmp_path, "applied [mT],tip_uz [mm]\n10,10.6\n")

@@ -44,6 +44,7 @@ def written(folder: Path) -> tuple[Path, Path]:
     return case, data
 
 
+@pytest.mark.slow
 def test_bands_of_another_history(tmp_path: Path) -> None:
     """Those of slopes, with field and remanence reversed, which changes nothing; of two data one is inside."""
     case, data = written(tmp_path)

@@ -79,6 +79,7 @@ def test_in_time() -> None:
     assert rows[-1]["upper_tip_uz_mm"] == pytest.approx(alone(motion, ON_HALVES, thickness="0.8 mm"), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_sweep(tmp_path: Path) -> None:
     """Over the thickness of one: this one as alone, the other as it was; 1e-9."""
     done = magshell("sweep", written(tmp_path), "--over", f"{THICK}=0.7mm,0.9mm", "--out", tmp_path / "sweep")
@@ -103,6 +104,7 @@ def test_ensemble(tmp_path: Path) -> None:
         assert float(row["result"]) == pytest.approx(alone(**flaw), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_random_defects(tmp_path: Path) -> None:
     """The first shell has the defects that it has alone, by the same seed; the other one has others: 1e-9."""
     draw = {"kind": "uniform", "above": 0.1, "below": 0.8}
@@ -157,6 +159,7 @@ def test_gradients(tmp_path: Path) -> None:
     assert "shells.upper.shell.polar: a number of the mesh, of the shape" in done.stderr
 
 
+@pytest.mark.slow
 def test_design(tmp_path: Path) -> None:
     """The thickness of the upper cap at which its tip sinks as that of a cap of 0.83 mm does, 1e-3; verified finer."""
     wanted = {"reach": "upper_tip_uz_mm", "value": alone(thickness="0.83 mm")}
