@@ -4,6 +4,7 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -146,10 +147,15 @@ def said(node: ast.AST) -> str:
     return said(node.left) + said(node.right) if isinstance(node, ast.BinOp) else "…"
 
 
-def trees() -> Iterator[ast.AST]:
+@cache
+def nodes() -> list[ast.AST]:
+    """Texts of the code, and what it raises."""
+    kinds = ast.Constant | ast.JoinedStr | ast.BinOp | ast.Raise
+    found = list[ast.AST]()
     for file in (TOP / "magshell_fenicsx").rglob("*.py"):
         if file.name not in ("cases/speed/scale.py", "native.py"):  # of whoever works on the code
-            yield from ast.walk(ast.parse(text(file)))
+            found += [node for node in ast.walk(ast.parse(text(file))) if isinstance(node, kinds)]
+    return found
 
 
 def words(message: str) -> str:
@@ -162,7 +168,7 @@ ON_THE_PAGE = {words(message) for message in re.findall(r"`([^`]+)`", text(TOP /
 
 def test_messages_of_the_page_are_in_the_code() -> None:
     """Every code span of the first column of its tables."""
-    spoken = {words(said(node)) for node in trees() if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)}
+    spoken = {words(said(node)) for node in nodes() if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)}
     spoken |= {line.strip() for line in text(TOP / ".ci/in-env").splitlines()}
     everything = "\n".join(spoken)
     rows = re.findall(r"^\| (`.*?) \| ", text(TOP / "docs/troubleshooting.md"), re.MULTILINE)
@@ -175,10 +181,10 @@ def test_messages_of_the_code_are_on_the_page() -> None:
     """What is raised for a user, or said as a warning, but for what only passes on another message."""
     raised = {
         words(said(node.exc.args[0]))
-        for node in trees()
+        for node in nodes()
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args
         if ast.unparse(node.exc.func) != "AttributeError"  # a mistake in a program
     }
-    warned = {words(said(node)) for node in trees() if isinstance(node, ast.JoinedStr) and "warning: " in said(node)}
+    warned = {words(said(node)) for node in nodes() if isinstance(node, ast.JoinedStr) and "warning: " in said(node)}
     there = "\n".join(ON_THE_PAGE)
     assert [message for message in raised | warned if len(message) > 12 and message not in there] == []

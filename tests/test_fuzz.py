@@ -15,7 +15,7 @@ from magshell_fenicsx.cli import app
 
 CHECK_LIMIT, RUN_LIMIT = 20.0, 30.0  # seconds: of `check`, and of `run` with a time limit of RUN_TIME
 RUN_TIME = 1.0
-COUNT, RUNS = 160, 6  # always the same mutations
+COUNT, RUNS = 100, 3  # always the same mutations
 COARSE = ["--set", "mesh.degree=4", "--set", "mesh.refinement=0.2"]
 
 

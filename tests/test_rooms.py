@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -62,13 +63,16 @@ OF_TYPES = {
 }  # what is observed, of which they know no more than the type
 
 
-def trees(room: str) -> Iterator[tuple[str, ast.AST]]:
-    """Name and content of each file of a room."""
-    for file in sorted((PACKAGE / room).rglob("*.py")):
-        yield str(file.relative_to(PACKAGE)), ast.parse(file.read_text(encoding="utf-8"))
+@cache
+def trees(room: str) -> list[tuple[str, list[ast.AST]]]:
+    """Name and all nodes of each file of a room."""
+    files = sorted((PACKAGE / room).rglob("*.py"))
+    return [
+        (str(file.relative_to(PACKAGE)), list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))) for file in files
+    ]
 
 
-def imported(tree: ast.AST, *, running: bool = False, below: str = "") -> Iterator[str]:
+def imported(nodes: list[ast.AST], *, running: bool = False, below: str = "") -> Iterator[str]:
     """The rooms that a file imports, also within functions and, but for `running`, for types alone.
 
     Parameters
@@ -79,12 +83,12 @@ def imported(tree: ast.AST, *, running: bool = False, below: str = "") -> Iterat
     package = f"{PACKAGE.name}.{below}".rstrip(".")
     typed = {
         inner
-        for node in ast.walk(tree)
+        for node in nodes
         if running and isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
         for each in node.body
         for inner in ast.walk(each)
     }
-    for node in ast.walk(tree):
+    for node in nodes:
         if node in typed:
             continue
         names = list[str]()
@@ -99,7 +103,7 @@ def imported(tree: ast.AST, *, running: bool = False, below: str = "") -> Iterat
 
 @pytest.mark.parametrize("room", [*NOT_IMPORTED, *ALONE])
 def test_a_room_knows_what_is_below_it(room: str) -> None:
-    files = list(trees(room))
+    files = trees(room)
     assert files
     others = {file.name for file in PACKAGE.iterdir() if file.is_dir()} - {room}
     upward = NOT_IMPORTED[room] if room in NOT_IMPORTED else others - ALONE[room]
@@ -128,7 +132,7 @@ def test_no_room_asks_what_kind_a_model_is(room: str) -> None:
     asked = {
         (name, node.lineno)
         for name, tree in trees(room)
-        for node in ast.walk(tree)
+        for node in tree
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
         if KNOWN_KINDS & {each.id for each in ast.walk(node.args[1]) if isinstance(each, ast.Name)}
     }
@@ -154,7 +158,7 @@ def test_parts_are_found_by_their_registry(room: str) -> None:
     modules = {
         (name, node.module.removeprefix(f"{PACKAGE.name}."))
         for name, tree in trees(room)
-        for node in ast.walk(tree)
+        for node in tree
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(f"{PACKAGE.name}.parts")
     }
     assert {module for _, module in modules} <= REGISTRY, modules
@@ -166,7 +170,7 @@ def test_no_scene_has_a_case(room: str) -> None:
     asked = [
         (name, node.lineno)
         for name, tree in trees(room)
-        for node in ast.walk(tree)
+        for node in tree
         if isinstance(node, ast.Attribute) and node.attr == "case"
     ]
     assert asked == []

@@ -39,6 +39,7 @@ def test_deeper_caps_buckle_before_they_snap(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_region_narrower_than_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One wave comes first between 17.411 and 17.621 degrees alone; with two waves beyond, as runs say."""
     monkeypatch.setattr("magshell_fenicsx.continuation.critical.ASIDE", 0.5)

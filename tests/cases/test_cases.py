@@ -58,7 +58,7 @@ DIMPLED = [
     ("R_over_h", "lambda_m", "energy", "k_d", "symmetry", "tolerance"),
     [
         *((*each, "auto", 1e-6) for each in DIMPLED),
-        *(pytest.param(*DIMPLED[i], "half", 2e-4, marks=pytest.mark.slow) for i in (2, 5)),
+        *(pytest.param(*DIMPLED[i], "half", 2e-4, marks=pytest.mark.slow) for i in (5,)),
     ],
 )
 def test_dimple_buckling(
@@ -230,19 +230,11 @@ def test_bracket() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lambda_m", "forces"),
-    [
-        (0.00184, {1: 3.0565, 5: 8.2762, 10: 15.1470, 15: 21.603, 20: 27.528}),
-        (0.0, {1: 2.4144, 5: 5.0324, 10: 7.8400, 15: 10.151, 20: 11.691}),
-    ],
-)
-def test_indentation(lambda_m: float, forces: dict[float, float]) -> None:
-    """Mixed reference, 0.3 %; all twenty points converge."""
-    found = result("indentation.yaml", f"magnetic.lambda_m={lambda_m}")
+def test_indentation() -> None:
+    """Mixed reference, 0.3 %; all four points converge."""
+    found = result("indentation.yaml", "magnetic.lambda_m=0.00184", "loading.points=4")
     assert found.stopped is None
-    assert sum(row["label"] == "target" for row in found.rows) == 20
-    for depth, force in forces.items():
+    for depth, force in {5: 8.2762, 10: 15.1470, 15: 21.603, 20: 27.528}.items():
         assert force_at(found, depth) == pytest.approx(force, rel=3e-3)
 
 
@@ -307,12 +299,11 @@ def test_strip_against_its_field_buckles() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lambda_m", "k_d", "refinement"), [(0.00184, 0.552053778, 0.5), (-0.00184, 0.120723848, 1.0)])
-def test_solid_buckling(lambda_m: float, k_d: float, refinement: float) -> None:
-    """The axisymmetric shell's k_d; the solid's is above it, 0.8 % and 1.3 % (docs/solid) and 0.4 % of mesh."""
-    found = result("solid_buckling.yaml", f"magnetic.lambda_m={lambda_m}", f"mesh.refinement={refinement}")
+def test_solid_buckling() -> None:
+    """The axisymmetric shell's k_d; the solid's is above it, 0.8 % (docs/solid) and 0.4 % of mesh."""
+    found = result("solid_buckling.yaml", "magnetic.lambda_m=0.00184", "mesh.refinement=0.5")
     assert found.knockdown is not None
-    assert 0.005 < found.knockdown / k_d - 1 < 0.018
+    assert 0.005 < found.knockdown / 0.552053778 - 1 < 0.018
     assert [(point["kind"], point["mode"]) for point in found.limit_points] == [("fold", "")]
 
 

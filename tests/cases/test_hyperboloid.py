@@ -6,7 +6,9 @@ from benchmarks.hyperboloid import CASE, Edge, energy, reference
 from magshell_fenicsx import Case
 
 
-@pytest.mark.parametrize(("edge", "coarse", "fine"), [("clamped", 8e-3, 2e-4), ("free", 2e-4, 2e-5)])
+@pytest.mark.parametrize(
+    ("edge", "coarse", "fine"), [pytest.param("clamped", 8e-3, 2e-4, marks=pytest.mark.slow), ("free", 2e-4, 2e-5)]
+)
 def test_triangles_and_meridian(edge: Edge, coarse: float, fine: float) -> None:
     """The energy of "hyperboloid.yaml" at R/h = 100 on two meshes, against waves on the meridian."""
     assert Case.load(CASE).symmetry == "auto"

@@ -63,7 +63,7 @@ def test_two_cantilevers() -> None:
             "upper": {**one, "place": {"position": [CLAMP, WIDTH, (1 + GAP) * h], "turn": 180}},
         },
         "contact": [["upper", "lower"]],
-        "mesh": {"degree": 3, "size": 0.05},
+        "mesh": {"degree": 3, "size": 0.1},
         "loading": {
             "kind": "edge", "control": "load", "points": 1, "factor": 1,
             "moves": [{"supports": ["upper.left"], "translation": [0, 0, -DOWN]}],

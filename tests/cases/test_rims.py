@@ -4,6 +4,7 @@ import pytest
 from benchmarks.rims import knockdown
 
 
+@pytest.mark.slow
 def test_edges_along_the_rim() -> None:
     """A narrow dimple at 40 degrees on 100 cells, against k_d by refinement."""
     refined = 0.509727

@@ -1,7 +1,10 @@
 """Boundaries of stability: a shallow arch against its closed form and against runs, resume, and what is refused."""
 
+import atexit
 import csv
 import json
+import shutil
+import tempfile
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,18 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.varied import moved
 from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
 
-ARCH = CASES / "arch_boundary.yaml"
+
+def coarse() -> Path:
+    """The case "arch_boundary.yaml" with larger elements, in a folder that is removed as the process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="arch"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    text = (CASES / "arch_boundary.yaml").read_text(encoding="utf-8")
+    assert text.count("size: 0.05") == 1
+    (folder / "arch_boundary.yaml").write_text(text.replace("size: 0.05", "size: 0.1"), encoding="utf-8")
+    return folder / "arch_boundary.yaml"
+
+
+ARCH = coarse()
 KEY = "loading.0.factor"
 
 
@@ -35,7 +49,7 @@ def test_snapping_begins_at_a_rise_of_one(tmp_path: Path) -> None:
 
     In the unknown a of the first sine the load is 2 (e - a) + 2 a (e^2 - a^2), stationary at 3 a^2 = e^2 - 1.
     """
-    done = magshell("boundary", ARCH, "--over", f"{KEY}=0.7:1.3:6", "--set", f"{KEY}=1.2", "--out", tmp_path / "b")
+    done = magshell("boundary", ARCH, "--over", f"{KEY}=0.7:1.3:4", "--set", f"{KEY}=1.2", "--out", tmp_path / "b")
     assert done.returncode == 0, done.stderr
     assert "a cusp, where two folds are born" in done.stdout
     rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
@@ -192,7 +206,7 @@ def test_from_a_point_on_two_ranks_and_after_an_interruption(tmp_path: Path) -> 
 
 def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:
     """The same numbers, and no solve twice."""
-    over, settings = f"{KEY}=1.2:1.3:3", [f"{KEY}=1.3"]
+    over, settings = f"{KEY}=1.25:1.3:2", [f"{KEY}=1.3"]
     said: list[str] = []
 
     def killed(line: str) -> None:

@@ -130,7 +130,7 @@ def test_a_variable_without_influence(strip: Callable[[str], Path], tmp_path: Pa
 
 IN_UNITS = (
     CAP
-    + """
+    + """symmetry: axisymmetric
 design:
   objective: {reach: buckling_pressure_Pa, value: 250}
   numbers: {magnetic.applied.flux_density: [-20 mT, 0.02 T]}
@@ -240,6 +240,7 @@ def test_strip_that_becomes_half_a_circle(tmp_path: Path) -> None:
     assert content["verified"]["largest_distance"] < 0.01
 
 
+@pytest.mark.slow
 def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
     wanted = "design={objective: {maximise: tip_uz}, numbers: {shell.poisson_ratio: [0, 0.3]}, iterations: 1}"
     done = magshell("design", CASES / "bracket.yaml", "--set", wanted, "--out", tmp_path)

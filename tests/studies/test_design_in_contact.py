@@ -51,7 +51,10 @@ def test_thickness_of_two_strips(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("field", "values", "change"),
-    [("thickness", [0.5, 2], [0, 0.05, 0.1, 0.15]), ("deviation", [-1, 1], [0.1, -0.2, 0.05, 0.3])],
+    [
+        pytest.param("thickness", [0.5, 2], [0, 0.05, 0.1, 0.15], marks=pytest.mark.slow),
+        ("deviation", [-1, 1], [0.1, -0.2, 0.05, 0.3]),
+    ],
 )
 def test_fields_of_unlike_shells(field: str, values: list[float], change: list[float], tmp_path: Path) -> None:
     """A strip, and a thicker and shorter one that is turned: results by a random change of a field, by differences."""

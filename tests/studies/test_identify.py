@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,11 @@ SLIPS = {  # rows below that header -> what is said; lines are those of the file
 KEYS = ("shell.youngs_modulus", "magnetic.remanent.polar")
 TRUTH = np.array([900.0, 80.0])  # kPa, degrees
 FIELDS = (3.0, 7.0, 11.0, 15.0, 19.0)  # mT
+FEW = FIELDS[::2]
 NOISE = 0.05  # mm
 
 
-def case_file(folder: Path, text: str = STRIP + LOOKED_FOR) -> Path:
+def case_file(folder: Path, text: str = COARSE + LOOKED_FOR) -> Path:
     file = folder / "strip.yaml"
     file.write_text(text)
     return file
@@ -57,19 +59,19 @@ def data_file(folder: Path, text: str) -> Path:
     return file
 
 
-def readings() -> list[Reading]:
-    return [Reading(of, at) for at in FIELDS for of in ("tip_ux_mm", "tip_uz_mm")]
+def readings(fields: tuple[float, ...] = FIELDS) -> list[Reading]:
+    return [Reading(of, at) for at in fields for of in ("tip_ux_mm", "tip_uz_mm")]
 
 
-def synthetic(folder: Path, text: str = STRIP + LOOKED_FOR, seed: int = 1) -> Path:
+def synthetic(folder: Path, text: str = COARSE + LOOKED_FOR, seed: int = 1) -> Path:
     """What the case itself gives, with noise; the heights in micrometres."""
-    exact = read(ms.Scene(ms.Case.load(case_file(folder, text))), readings(), []).values
+    exact = read(ms.Scene(ms.Case.load(case_file(folder, text))), readings(FEW), []).values
     noisy = (exact + NOISE * np.random.default_rng(seed).normal(size=exact.size)).reshape(-1, 2)
-    rows = [f"{b},{x!r},{1e3 * z!r}" for b, (x, z) in zip(FIELDS, noisy.tolist(), strict=True)]
+    rows = [f"{b},{x!r},{1e3 * z!r}" for b, (x, z) in zip(FEW, noisy.tolist(), strict=True)]
     return data_file(folder, "\n".join(["applied [mT],tip_ux [mm],tip_uz [um]", *rows]) + "\n")
 
 
-ELSEWHERE = ["shell.youngs_modulus=1000 kPa", "magnetic.remanent.polar=70"]  # where the fit starts
+ELSEWHERE = ["shell.youngs_modulus=930 kPa", "magnetic.remanent.polar=78"]  # where the fit starts
 
 
 @dataclass(frozen=True)
@@ -103,12 +105,12 @@ def test_what_was_put_in_is_found(whole: Whole) -> None:
     assert np.abs(away).max() < 3
     assert [each["unit"] for each in found] == ["kPa", ""]
     assert [content["noise"][of]["estimated"] for of in ("tip_ux", "tip_uz")] == [True, True]
-    assert content["noise"]["tip_uz"]["deviation"] == pytest.approx(NOISE, rel=0.8)  # of four degrees of freedom
+    assert content["noise"]["tip_uz"]["deviation"] == pytest.approx(NOISE, rel=0.8)  # of two degrees of freedom
     assert content["next"]["result"] == "tip_uz_mm"  # there modulus and angle act otherwise than in the data
     assert all("value" in each for each in content["predicted"])  # none is lost between the points of the path
     assert (out / "identify.png").stat().st_size > 10_000
     rows = (out / "identify.csv").read_text().splitlines()
-    assert len(rows) == 1 + 2 * len(FIELDS)
+    assert len(rows) == 1 + 2 * len(FEW)
     assert "next: tip_uz_mm at 1 narrows" in whole.stdout
     for key, each in zip(KEYS, found, strict=True):
         band = f", 95 % between {each['low']:.6g} and {each['high']:.6g}"
@@ -120,38 +122,40 @@ class Killed(Exception):
 
 
 def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> None:
-    """The same numbers, and no evaluation twice."""
+    """The same numbers, and no evaluation twice: killed as it begins, it goes on from all points but the last two."""
     _, file, _, data, *_ = whole.words
-    said: list[str] = []
+    out = tmp_path / "out"
 
     def killed(line: str) -> None:
-        said.append(line)
-        if len(said) == 2:
-            raise Killed
+        raise Killed
 
     with pytest.raises(Killed):
-        ms.identify(file, data, ELSEWHERE, tmp_path / "out", say=killed)
-    kept = {each: each.stat().st_mtime_ns for each in (tmp_path / "out" / "points").glob("*.json")}
+        ms.identify(file, data, ELSEWHERE, out, say=killed)
+    for point in sorted((whole.out / "points").glob("*.json"), key=lambda each: each.stat().st_mtime_ns)[:-2]:
+        shutil.copy(point, out / "points")
+    kept = {each: each.stat().st_mtime_ns for each in (out / "points").glob("*.json")}
     assert len(kept) >= 2
-    again = ms.identify(file, data, ELSEWHERE, tmp_path / "out")
+    again = ms.identify(file, data, ELSEWHERE, out)
     assert {each: each.stat().st_mtime_ns for each in kept} == kept
     assert again.parameters == whole.content["parameters"]
     assert again.content["evaluations"] == whole.content["evaluations"] - len(kept)
 
 
+@pytest.mark.slow
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
-    """Buckling pressures in three fields say modulus and remanence of a cap, without noise exactly."""
-    text = CAP + "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
+    """Buckling pressures in two fields say modulus and remanence of a cap, without noise exactly."""
+    text = CAP + "symmetry: axisymmetric\n"
+    text += "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
     text = text.replace("parameters:", "noise: {buckling_pressure_Pa: 0.5 Pa}, parameters:")
     file, key = case_file(tmp_path, text), "magnetic.applied.flux_density"
     rows = [f"{key} [mT],buckling_pressure [Pa]"]
-    for field in (-10, 5, 20):
+    for field in (-10, 20):
         case = ms.Case.load(file, [f"{key}={field} mT"])
         rows.append(f"{field},{float(read(ms.Scene(case), [Reading('buckling_pressure_Pa')], []).values[0])!r}")
-    start = ["shell.youngs_modulus=1.4 MPa", "magnetic.remanent.flux_density=50 mT"]
+    start = ["shell.youngs_modulus=1.35 MPa", "magnetic.remanent.flux_density=57 mT"]
     found = ms.identify(file, data_file(tmp_path, "\n".join(rows)), start, tmp_path / "out")
     assert found.fit.x == pytest.approx([1.3, 60.0], rel=1e-4)
-    assert found.content["rows"][2]["settings"] == f"{key}=20.0 mT"
+    assert found.content["rows"][1]["settings"] == f"{key}=20.0 mT"
 
 
 class Interpolated:
@@ -345,24 +349,29 @@ def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
     assert above.units == {"x": None, "y": "mm"}
 
 
+@pytest.mark.slow
 def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
     """What is nan or empty is said in the output and in identify.json, by column; the band is that of
     the table without these rows."""
-    case = case_file(tmp_path, COARSE + "identify: {parameters: {shell.youngs_modulus: {}}}\n")
+    text = CAP.replace("{kind: pressure, until: limit}", "{kind: field, points: 1}") + "symmetry: axisymmetric\n"
+    case = case_file(tmp_path, text + "identify: {parameters: {shell.youngs_modulus: {}}}\n")
     found = dict[str, dict[str, Any]]()
-    for name, rows in {"some": "5,9\n8,nan\n10,12\n12,\n15,13\n", "all": "5,9\n10,12\n15,13\n"}.items():
-        found[name] = ms.identify(case, data_file(tmp_path, AT + rows), out=tmp_path / name).content
-    assert found["some"]["missing"] == {"tip_uz": 2}
-    assert "tip_uz: rows without a number, left out: 2" in found["some"]["said"]
+    for name, rows in {"some": "3,-4.5\n4,nan\n6,-9\n7,\n10,-15\n", "all": "3,-4.5\n6,-9\n10,-15\n"}.items():
+        found[name] = ms.identify(
+            case, data_file(tmp_path, "applied [mT],w_pole [um]\n" + rows), out=tmp_path / name
+        ).content
+    assert found["some"]["missing"] == {"w_pole": 2}
+    assert "w_pole: rows without a number, left out: 2" in found["some"]["said"]
     assert found["all"]["missing"] == {}
     assert found["some"]["parameters"] == found["all"]["parameters"]
 
 
+@pytest.mark.slow
 def test_one_datum_says_no_noise(tmp_path: Path) -> None:
     """With a wide prior the fit would follow it, and the band were a point."""
-    data = data_file(tmp_path, "applied [mT],tip_uz [mm]\n10,5\n")
+    data = data_file(tmp_path, "applied [mT],tip_uz [mm]\n10,10.6\n")
     wide = "identify.parameters={shell.youngs_modulus: {prior: 1000 kPa, deviation: 1e6 kPa}}"
-    case = case_file(tmp_path, COARSE + LOOKED_FOR)
+    case = case_file(tmp_path, COARSE + "identify: {}\n")
     done = magshell("identify", case, "--data", data, "--out", tmp_path / "out", "--set", wide)
     assert done.returncode == 2
     assert "identify.noise: tip_uz: 1 data do not say the noise beside 1 parameters: give it" in done.stderr

@@ -26,7 +26,9 @@ CAP = {
 }
 TIP = {"tip": [0, 0, "25 mm"]}
 FLAW = {"imperfections": [{"kind": "gaussian", "amplitude": 0.3, "width": 0.2}]}
-MESH = {"degree": 3, "size": "8 mm"}
+MESH, COARSE = {"degree": 3, "size": "4 mm"}, {"degree": 3, "size": "8 mm"}  # on meridians, on surfaces
+ON_MERIDIANS: dict[str, Any] = {"mesh": MESH}
+ON_HALVES: dict[str, Any] = {"mesh": COARSE, "symmetry": "half"}
 LOAD = {"kind": "pressure", "control": "load", "until": "target", "pressure": "300 Pa", "points": 1}
 THICK = "shells.upper.shell.thickness"
 
@@ -39,12 +41,12 @@ def two(**keys: Any) -> dict[str, Any]:
     """Caps one above the other: the lower one has an imperfection, the upper one is thicker."""
     upper = one(thickness="0.8 mm") | {"place": {"position": [0, 0, "10 mm"]}}
     shells = {"lower": one(**FLAW), "upper": upper}
-    return {"shells": shells, "mesh": MESH, "loading": LOAD, "symmetry": "half"} | keys
+    return {"shells": shells, "mesh": MESH, "loading": LOAD} | keys
 
 
-def alone(loading: dict[str, Any] = LOAD, **shell: Any) -> float:
+def alone(loading: dict[str, Any] = LOAD, on: dict[str, Any] = ON_MERIDIANS, **shell: Any) -> float:
     """How far the tip of one cap moves at the end, in mm."""
-    rows = run(Case.from_source(one(**shell) | {"mesh": MESH, "loading": loading, "symmetry": "half"})).rows
+    rows = run(Case.from_source(one(**shell) | {"loading": loading} | on)).rows
     return float(rows[-1]["tip_uz_mm"])
 
 
@@ -72,11 +74,12 @@ def test_in_time() -> None:
         "duration": "1 ms",
         "points": 1,
     }
-    rows = run(Case.from_source(two(loading=motion))).rows
-    assert rows[-1]["lower_tip_uz_mm"] == pytest.approx(alone(motion, **FLAW), rel=1e-2)
-    assert rows[-1]["upper_tip_uz_mm"] == pytest.approx(alone(motion, thickness="0.8 mm"), rel=1e-2)
+    rows = run(Case.from_source(two(loading=motion, mesh=COARSE, symmetry="half"))).rows
+    assert rows[-1]["lower_tip_uz_mm"] == pytest.approx(alone(motion, ON_HALVES, **FLAW), rel=1e-2)
+    assert rows[-1]["upper_tip_uz_mm"] == pytest.approx(alone(motion, ON_HALVES, thickness="0.8 mm"), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_sweep(tmp_path: Path) -> None:
     """Over the thickness of one: this one as alone, the other as it was; 1e-9."""
     done = magshell("sweep", written(tmp_path), "--over", f"{THICK}=0.7mm,0.9mm", "--out", tmp_path / "sweep")
@@ -101,15 +104,16 @@ def test_ensemble(tmp_path: Path) -> None:
         assert float(row["result"]) == pytest.approx(alone(**flaw), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_random_defects(tmp_path: Path) -> None:
     """The first shell has the defects that it has alone, by the same seed; the other one has others: 1e-9."""
     draw = {"kind": "uniform", "above": 0.1, "below": 0.8}
     defects = {"count": 2, "amplitude": draw, "width": 1.5, "polar": [0, 10]}
-    case = written(tmp_path, symmetry="none", ensemble={"defects": defects})
+    case = written(tmp_path, mesh=COARSE, symmetry="none", ensemble={"defects": defects})
     out = tmp_path / "out"
     done = magshell("ensemble", case, "--samples", 2, "--seed", 1, "--result", "lower_tip_uz_mm@end", "--out", out)
     assert done.returncode == 0, done.stderr
-    bare = one() | {"mesh": MESH, "loading": LOAD, "symmetry": "none", "ensemble": {"defects": defects}}
+    bare = one() | {"mesh": COARSE, "loading": LOAD, "symmetry": "none", "ensemble": {"defects": defects}}
     for row, sample in zip(rows_of(out / "samples.csv"), drawn(bare), strict=True):
         values = {f"shells.lower.{key}": value for key, value in sample.values.items()}
         assert {key: float(row[key]) for key in values} == values
@@ -155,15 +159,16 @@ def test_gradients(tmp_path: Path) -> None:
     assert "shells.upper.shell.polar: a number of the mesh, of the shape" in done.stderr
 
 
+@pytest.mark.slow
 def test_design(tmp_path: Path) -> None:
-    """The thickness of the upper cap at which its tip sinks as that of a cap of 0.9 mm does, 1e-3; verified finer."""
-    wanted = {"reach": "upper_tip_uz_mm", "value": alone(thickness="0.9 mm")}
-    case = written(tmp_path, design={"objective": wanted, "numbers": {THICK: ["0.6 mm", "1.2 mm"]}, "iterations": 20})
+    """The thickness of the upper cap at which its tip sinks as that of a cap of 0.83 mm does, 1e-3; verified finer."""
+    wanted = {"reach": "upper_tip_uz_mm", "value": alone(thickness="0.83 mm")}
+    case = written(tmp_path, design={"objective": wanted, "numbers": {THICK: ["0.6 mm", "1 mm"]}, "iterations": 20})
     done = magshell("design", case, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     best = yaml.safe_load((tmp_path / "out" / "best.yaml").read_text(encoding="utf-8"))
     thickness = best["shells"]["upper"]["shell"]["thickness"]
-    assert float(str(thickness).split()[0]) == pytest.approx(0.9, rel=1e-3)
+    assert float(str(thickness).split()[0]) == pytest.approx(0.83, rel=1e-3)
     assert "verified (mesh.refinement=1.5)" in done.stdout
 
 
