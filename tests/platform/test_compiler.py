@@ -27,7 +27,7 @@ def test_one_compiles_and_the_others_wait(cache: Path) -> None:
         return SOURCE
 
     def seven(_: int) -> int:
-        return int(ctypes.CDLL(str(compiler.library("seven", source, ("-O0",)))).seven())
+        return int(ctypes.CDLL(str(compiler.Library("seven", source, ("-O0",)).path())).seven())
 
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(seven, range(4))) == [7] * 4
@@ -38,7 +38,7 @@ def test_one_compiles_and_the_others_wait(cache: Path) -> None:
 @pytest.mark.telling
 def test_options_and_names_make_another_library(cache: Path) -> None:
     made = {
-        compiler.library(*of)
+        compiler.Library(*of).path()
         for of in (("a", lambda: SOURCE, ()), ("b", lambda: SOURCE, ()), ("a", lambda: SOURCE, ("-O1",)))
     }
     assert len(made) == 3
@@ -47,7 +47,7 @@ def test_options_and_names_make_another_library(cache: Path) -> None:
 def test_code_that_is_none(cache: Path) -> None:
     """The compiler's words are on stderr, and no library is left."""
     with pytest.raises(subprocess.CalledProcessError):
-        compiler.library("broken", lambda: "int seven(void) { return", ())
+        compiler.Library("broken", lambda: "int seven(void) { return", ()).path()
     assert not list(cache.glob("*.so"))
 
 
@@ -56,4 +56,3 @@ def test_a_full_disk(tmp_path: Path) -> None:
     reason = r"^kernels cannot be compiled into .*full: No space left on device$"
     with pytest.raises(RuntimeError, match=reason), compiler.written_into(tmp_path / "full"):
         Path("/dev/full").write_text("x", encoding="utf-8")
-    compiler.check_room(tmp_path)
