@@ -151,6 +151,8 @@ class Status:
 
     def compile(self, libraries: Sequence[Library]) -> None:
         """Compile libraries side by side; see there."""
+        if not libraries:
+            return
         begin = time.perf_counter()
         self.known += len(libraries)
 

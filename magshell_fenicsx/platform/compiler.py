@@ -155,6 +155,7 @@ def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lam
                 wait(running, RENEWED, FIRST_COMPLETED)
             else:
                 time.sleep(POLL)
+        tell(len(libraries))
     except BaseException:
         for each in libraries:
             each.cancel()
