@@ -28,6 +28,7 @@ from magshell_fenicsx.platform.processes import raised_by_all
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
+# -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
 FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
 SHORT = 1.0  # s of compilation that nobody need be told of
 Key = tuple[str, str, int]
@@ -138,7 +139,7 @@ def _entries(form: ufl.Form) -> int:
     """The size of the element tensor of a form, for a rough order of the times that kernels take to compile."""
     layouts = [each.ufl_function_space().dofmap for each in form.arguments()]
     sides = 1 + any(integral.integral_type() == "interior_facet" for integral in form.integrals())
-    return prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts)
+    return int(prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts))
 
 
 @dataclass

@@ -170,7 +170,7 @@ def _running(libraries: Iterable[Library]) -> list["Future[Path]"]:
 def cores() -> int:
     """How many compilers this process runs at once: ranks share the cores that they see."""
     seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, seen // world().size)
+    return max(1, seen // int(world().size))
 
 
 @cache
