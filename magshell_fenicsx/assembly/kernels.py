@@ -23,7 +23,7 @@ from ufl.algorithms.analysis import has_type
 from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.platform.compiler import Library, side_by_side
+from magshell_fenicsx.platform.compiler import RENEWED, Library, side_by_side
 from magshell_fenicsx.platform.processes import raised_by_all
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
@@ -31,6 +31,7 @@ from magshell_fenicsx.platform.processes import raised_by_all
 # -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
 FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
 SHORT = 1.0  # s of compilation that nobody need be told of
+
 Key = tuple[str, str, int]
 
 
@@ -155,10 +156,14 @@ class Status:
         if not libraries:
             return
         begin = time.perf_counter()
+        last = 0, begin + SHORT - RENEWED
         self.known += len(libraries)
 
         def told(there: int) -> None:
-            if time.perf_counter() - begin > SHORT:
+            nonlocal last
+            now, (before, then) = time.perf_counter(), last
+            if now - begin >= SHORT and (there != before or now - then >= RENEWED):
+                last = there, now
                 self.tell(f"compiling kernels (once) {self.done + there} of {self.known}")
 
         side_by_side(libraries, told)

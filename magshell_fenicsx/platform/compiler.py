@@ -147,10 +147,11 @@ def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lam
     """
     try:
         while missing := [each for each in libraries if not each.there]:
+            tell(len(libraries) - len(missing))
             for each in missing:
-                if len(_running(missing)) <= cores():
+                if not each.work and len(_running(missing)) <= cores():
                     each.start()
-                tell(sum(each.there for each in libraries))
+                    tell(sum(each.there for each in libraries))
             if running := _running(missing):
                 wait(running, RENEWED, FIRST_COMPLETED)
             else:
