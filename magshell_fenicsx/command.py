@@ -199,7 +199,7 @@ def refuse_lost() -> None:
 def exit_codes(stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Turn an invalid input or an early stop into a message and its exit code.
 
-    An early stop is also a kernel that cannot be written, for which dolfinx raises the same on all ranks.
+    An early stop is also a kernel that cannot be written.
     """
     try:
         yield
@@ -208,6 +208,6 @@ def exit_codes(stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     except stopped as e:
         raise failure(f"stopped early: {e}", STOPPED) from None
     except RuntimeError as e:
-        if UNWRITTEN in str(e) or (world().rank and "Failed just-in-time compilation" in str(e)):
-            raise failure(f"stopped early: {str(e)[str(e).find(UNWRITTEN) :]}", STOPPED) from None
+        if str(e).startswith(UNWRITTEN):
+            raise failure(f"stopped early: {e}", STOPPED) from None
         raise

@@ -15,7 +15,6 @@ from petsc4py import PETSc
 
 from magshell_fenicsx import Scene
 from magshell_fenicsx.assembly.coupled import times
-from magshell_fenicsx.assembly.kernels import JIT_OPTIONS
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Skewed, State
@@ -38,7 +37,7 @@ def _compiled(term: FormTerm | HessianTerm) -> Direction:
         test = ufl.TestFunction(of.function_space)
         gradient = term._gradient if isinstance(term, FormTerm) else ufl.derivative(term._energy, of, test)
         direction = fem.Function(of.function_space)
-        vars(term)["along"] = direction, fem.form(ufl.derivative(gradient, of, direction), jit_options=JIT_OPTIONS)
+        vars(term)["along"] = direction, term._log.compile("along", ufl.derivative(gradient, of, direction))
     found: Direction = vars(term)["along"]
     return found
 

@@ -1,4 +1,7 @@
-"""Compilation: forms by dolfinx, functions at points by ours, and the time that both take.
+"""Compilation: forms by FFCx, functions at points by ours, and the time that both take.
+
+Kernels are begun where they are declared, and compiled side by side when the first of them is asked for: then it is
+known how many there are, and the largest, on which the others would wait at the end, are compiled first.
 
 Two scenes that differ only in numbers have the same forms. A process compiles each form once and keeps it under the
 signature of the form that it is derived from: for the next scene UFL neither differentiates nor signs the derivative.
@@ -6,11 +9,13 @@ signature of the form that it is derived from: for the next scene UFL neither di
 
 import ctypes
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache, partial
+from math import prod
 from typing import Any
 
-import cffi
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
@@ -18,14 +23,14 @@ from ufl.algorithms.analysis import has_type
 from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.platform.compiler import check_room, library
-from magshell_fenicsx.platform.kept import compiling, kernel_cache
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.compiler import RENEWED, Library, side_by_side
+from magshell_fenicsx.platform.processes import raised_by_all
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
-JIT_OPTIONS: dict[str, Any] = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math"], "timeout": 600}
-
+# -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
+FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
+SHORT = 1.0  # s of compilation that nobody need be told of
 
 Key = tuple[str, str, int]
 
@@ -87,31 +92,104 @@ class Derived:
         spaces = [each.ufl_function_space() for each in self.of.arguments()]
         if self.u is not None:
             spaces = [self.u.function_space] * shared.rank
-        of_mesh = self.of.subdomain_data()[self.of.ufl_domain()]
-        assert all(tags is data[0] for data in of_mesh.values() for tags in data)  # as dolfinx asks
-        return compat.bound(
-            shared.kernels,
-            spaces,
-            [fields[i] for i in shared.fields],
-            [numbers[i] for i in shared.numbers],
-            {kind: data[0] for kind, data in of_mesh.items()},
-            self.of.ufl_domain().ufl_cargo(),
-        )
+        given = [fields[i] for i in shared.fields], [numbers[i] for i in shared.numbers]
+        return _bound(self.of, shared.kernels, spaces, *given)
 
-    def shared(self, made: ufl.Form, compiled: fem.Form) -> _Shared | None:
+    def shared(self, made: ufl.Form, kernels: compat.Kernels) -> _Shared | None:
         """What is kept of the compiled form; None if it has other fields or numbers, or labels, which no other has."""
         if has_type(self.of, Label):
             return None
-        kernels = compat.kernels_of(compiled)
         fields = [_place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())]
         numbers = [_place(each, self.numbers) for each in made.constants()]
         if None in fields or None in numbers:
             return None
-        return _Shared(kernels, fields, numbers, compiled.rank)  # type: ignore[arg-type]
+        return _Shared(kernels, fields, numbers, len(made.arguments()))  # type: ignore[arg-type]
 
 
 def _place(one: Any, among: Iterable[Any]) -> int | None:
     return next((i for i, each in enumerate(among) if each is one), None)
+
+
+def _bound(
+    of: ufl.Form,
+    kernels: compat.Kernels,
+    spaces: Sequence[fem.FunctionSpace],
+    fields: Sequence[fem.Function],
+    numbers: Sequence[fem.Constant],
+) -> fem.Form:
+    """The kernels on the mesh of a form, and on the parts of it that this is over."""
+    domain = _domain_of(of)
+    of_mesh = of.subdomain_data()[domain]
+    assert all(tags is data[0] for data in of_mesh.values() for tags in data)  # as dolfinx asks
+    marks = {kind: data[0] for kind, data in of_mesh.items()}
+    return compat.bound(kernels, spaces, fields, numbers, marks, domain.ufl_cargo())
+
+
+def _domain_of(form: ufl.Form) -> ufl.Mesh:
+    """What it is integrated over."""
+    (domain,) = form.subdomain_data()
+    return domain
+
+
+def itself(form: ufl.Form) -> Derived:
+    """A form as it is."""
+    return Derived(form, "", lambda: form)
+
+
+def _entries(form: ufl.Form) -> int:
+    """The size of the element tensor of a form, for a rough order of the times that kernels take to compile."""
+    layouts = [each.ufl_function_space().dofmap for each in form.arguments()]
+    sides = 1 + any(integral.integral_type() == "interior_facet" for integral in form.integrals())
+    return int(prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts))
+
+
+@dataclass
+class Status:
+    """What is told while kernels are compiled: how many of how many; by default to nobody."""
+
+    tell: Callable[[str], None] = lambda _: None
+    done: int = 0
+    known: int = 0
+
+    def compile(self, libraries: Sequence[Library]) -> None:
+        """Compile libraries side by side; see there."""
+        if not libraries:
+            return
+        begin = time.perf_counter()
+        last = 0, begin + SHORT - RENEWED
+        self.known += len(libraries)
+
+        def told(there: int) -> None:
+            nonlocal last
+            now, (before, then) = time.perf_counter(), last
+            if now - begin >= SHORT and (there != before or now - then >= RENEWED):
+                last = there, now
+                self.tell(f"compiling kernels (once) {self.done + there} of {self.known}")
+
+        side_by_side(libraries, told)
+        self.done += len(libraries)
+
+
+_status = Status()
+
+
+@contextmanager
+def reported(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell a function how many kernels are compiled of how many, within `with`."""
+    global _status
+    before, _status = _status, Status(tell)
+    try:
+        yield
+    finally:
+        _status = before
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A library that is asked for, and how many numbers its function gives."""
+
+    library: Library
+    size: int
 
 
 @dataclass
@@ -120,51 +198,91 @@ class KernelLog:
 
     names: list[str] = field(default_factory=list)
     seconds: float = 0.0
+    _begun: dict[str, _Begun] = field(default_factory=dict)
 
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
-        """Compile a form, or load it from the cache."""
-        return self.derived(name, Derived(expression, "", lambda: expression))
+        """A compiled form; collective."""
+        return self.derived(name, itself(expression))
 
     def derived(self, name: str, form: Derived) -> fem.Form:
-        """Compile a form, or take what this process has compiled; collective."""
-        key = form.key
-        if key is None:
-            return self._compiled(name, form.make())
-        comm, start = form.of.ufl_domain().ufl_cargo().comm, time.perf_counter()
-        if comm.allreduce(key in _compiled_forms, MPI.LAND):  # ranks may have compiled others alone
-            bound = form.bound(_compiled_forms[key])
-            self._note(name, start)
-            return bound
-        made = form.make()
-        compiled = self._compiled(name, made)
-        if isinstance(made, ufl.Form) and compiled is not None and (shared := form.shared(made, compiled)):
-            _compiled_forms[key] = shared
+        """A compiled form; collective."""
+        (compiled,) = self._all({name: form})
         return compiled
 
-    def _compiled(self, name: str, expression: ufl.Form) -> fem.Form:
-        start, folder = time.perf_counter(), kernel_cache()
-        try:
-            with compiling(folder):
-                form = fem.form(expression, jit_options={**JIT_OPTIONS, "cache_dir": folder})
-        except (OSError, cffi.VerificationError):
-            check_room(folder)
-            raise
-        self._note(name, start)
-        return form
-
     def compile_all(self, named: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
-        """Compile forms under their names."""
-        return {name: self.compile(name, form) for each in named for name, form in each.items()}
+        """Compiled forms under their names; collective."""
+        forms = {name: form for each in named for name, form in each.items()}
+        compiled = self._all({name: itself(form) for name, form in forms.items()})
+        return dict(zip(forms, compiled, strict=True))
+
+    def _all(self, named: Mapping[str, Derived]) -> list[fem.Form]:
+        begun = [self.begin(name, form) for name, form in named.items()]
+        given = [form.of for form in named.values() if isinstance(form.of, ufl.Form) and not form.of.empty()]
+        if given:
+            self.finish(_domain_of(given[0]).ufl_cargo().comm)
+        return [compiled() for compiled in begun]
+
+    def begin(self, name: str, form: Derived) -> Callable[[], fem.Form]:
+        """What gives a compiled form: from this process, from the cache or from the compiler."""
+        start, key = time.perf_counter(), form.key
+        try:
+            if key in _compiled_forms:
+                known = form.bound(_compiled_forms[key])
+                return lambda: known
+            made = form.make()
+            if not isinstance(made, ufl.Form) or made.empty():
+                return lambda: None if isinstance(made, ufl.Form) else made
+            of_form = compat.form_signature(made), partial(compat.form_code, made), FORM_OPTIONS, _entries(made)
+            library = self._library(*of_form)
+            return cache(lambda: self._form(form, made, library()))
+        finally:
+            self._note(name, start)
+
+    def _form(self, form: Derived, made: ufl.Form, library: ctypes.CDLL) -> fem.Form:
+        kernels, key = compat.Kernels.of(made, library), form.key
+        if key and (shared := form.shared(made, kernels)):
+            _compiled_forms[key] = shared
+        spaces = [each.ufl_function_space() for each in made.arguments()]
+        return _bound(made, kernels, spaces, kernels.in_order(made.coefficients()), made.constants())
 
     def load(
-        self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], comm: MPI.Comm
-    ) -> ctypes.CDLL:
-        """Load a library, which rank 0 compiles if there is none; collective. See `library`."""
+        self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
+    ) -> Callable[[], ctypes.CDLL]:
+        """What gives a library, whose function gives `size` numbers. See `Library`."""
         start = time.perf_counter()
-        from_first(comm, lambda: library(key, source, options))
-        loaded = ctypes.CDLL(str(library(key, source, options)))  # where disks are not shared each rank has its own
+        library = self._library(key, source, options, size)
         self._note(name, start)
+        return library
+
+    def _library(
+        self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
+    ) -> Callable[[], ctypes.CDLL]:
+        library = Library(key, source, options)
+        begun = self._begun.setdefault(library.file, _Begun(library, size))
+
+        @cache
+        def loaded() -> ctypes.CDLL:
+            if library.file in self._begun:
+                self._finish()
+            return ctypes.CDLL(str(begun.library.path()))
+
         return loaded
+
+    def finish(self, comm: MPI.Comm) -> None:
+        """Compile what was begun; collective.
+
+        Raises
+        ------
+        RuntimeError
+            On all ranks, if one of them cannot.
+        """
+        raised_by_all(comm, self._finish)
+
+    def _finish(self) -> None:
+        start, begun = time.perf_counter(), sorted(self._begun.values(), key=lambda each: -each.size)
+        self._begun.clear()
+        _status.compile([each.library for each in begun if not each.library.there])
+        self.seconds += time.perf_counter() - start
 
     def _note(self, name: str, start: float) -> None:
         self.seconds += time.perf_counter() - start

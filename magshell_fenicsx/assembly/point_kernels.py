@@ -9,7 +9,7 @@ import ctypes
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,6 +27,7 @@ from ufl.domain import extract_domains
 from magshell_fenicsx.assembly import scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scalars import Scalars, flat, terminals_of
+from magshell_fenicsx.platform.compiler import processor_options
 from magshell_fenicsx.platform.kept import keep, recall
 
 Pair = tuple[int, int]
@@ -65,7 +66,7 @@ class Points:
 
 
 class PointKernel:
-    """A compiled function of fields and constants at points.
+    """A function of fields and constants at points, which is compiled when it is first evaluated, if not before.
 
     Attributes
     ----------
@@ -74,12 +75,20 @@ class PointKernel:
     """
 
     def __init__(
-        self, function: COMPILED, fields: Sequence[fem.Function], constants: Sequence[fem.Constant], size: int
+        self,
+        library: Callable[[], ctypes.CDLL],
+        fields: Sequence[fem.Function],
+        constants: Sequence[fem.Constant],
+        size: int,
     ) -> None:
-        self._function, self.size = function, size
+        self._library, self.size = library, size
         self._constants, self._fields = [c.value for c in constants], [f.x.array for f in fields]  # views
         self._places = np.array([values.ctypes.data for values in self._fields], np.uintp)
         self._sizes = np.array([f.ufl_shape[0] for f in fields], np.int32)
+
+    @cached_property
+    def _function(self) -> COMPILED:
+        return function_of(self._library())
 
     def evaluate(self, count: int, values: Array) -> None:
         """Fill a contiguous array (count, size) for the first points."""
@@ -91,9 +100,7 @@ class PointKernel:
 Made = Callable[[Scalars, list[list[int]]], list[int]]  # from the nodes of each expression
 
 
-def _kernel(
-    name: str, expressions: Sequence[Expr], asked: str, size: int, made: Made, log: KernelLog, comm: MPI.Comm
-) -> PointKernel:
+def _kernel(name: str, expressions: Sequence[Expr], asked: str, size: int, made: Made, log: KernelLog) -> PointKernel:
     """Compile what is made of some expressions, or load it.
 
     Parameters
@@ -111,8 +118,9 @@ def _kernel(
         graph, nodes = translated()
         return point_code(graph, made(graph, nodes))
 
-    library = log.load(name, _key_of(structure, lambda: _key(asked, *translated())), code, OPTIONS, comm)
-    return PointKernel(function_of(library), fields, constants, size)
+    key = _key_of(structure, lambda: _key(asked, *translated()))
+    library = log.load(name, key, code, (*OPTIONS, *processor_options()), size)
+    return PointKernel(library, fields, constants, size)
 
 
 _KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before, by its structure
@@ -164,14 +172,14 @@ def _version() -> str:
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
 
 
-def point_values(name: str, W: Expr, log: KernelLog, comm: MPI.Comm) -> PointKernel:
-    """Compile the components of an expression; all ranks of `comm` together."""
+def point_values(name: str, W: Expr, log: KernelLog) -> PointKernel:
+    """Compile the components of an expression."""
     size = int(np.prod(W.ufl_shape))
-    return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0], log, comm)
+    return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0], log)
 
 
-def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog, comm: MPI.Comm) -> PointKernel:
-    """Compile the sum of dW/dz for some W, each with its own z of the same size; all ranks of `comm` together."""
+def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog) -> PointKernel:
+    """Compile the sum of dW/dz for some W, each with its own z of the same size."""
     size = sums[0][1].ufl_shape[0]
 
     def made(graph: Scalars, nodes: list[list[int]]) -> list[int]:
@@ -181,7 +189,7 @@ def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: Ke
             total = [graph.add(t, first.get(i, graph.zero)) for t, i in zip(total, z, strict=True)]
         return total
 
-    return _kernel(name, [e for one in sums for e in one], "gradient", size, made, log, comm)
+    return _kernel(name, [e for one in sums for e in one], "gradient", size, made, log)
 
 
 @dataclass(frozen=True)
@@ -217,7 +225,7 @@ SKEW = [(0, 1), (0, 2), (1, 2)]
 
 
 def point_hessian(
-    name: str, W: Expr, z: fem.Function, parts: int, pairs: Pairs, log: KernelLog, comm: MPI.Comm, *, at_zero: bool
+    name: str, W: Expr, z: fem.Function, parts: int, pairs: Pairs, log: KernelLog, *, at_zero: bool
 ) -> PointKernel:
     """Compile the blocks of d2W/dz2, at z itself or at z = 0.
 
@@ -225,8 +233,6 @@ def point_hessian(
     ----------
     z
         Field of `parts` vectors, or twice as many for two sides.
-    comm
-        All its ranks compile together.
 
     Returns
     -------
@@ -257,11 +263,11 @@ def point_hessian(
         return graph.replaced(outputs, dict.fromkeys(inputs, graph.zero)) if at_zero else outputs
 
     size = sides * (6 * len(pairs.same) + 3 * len(pairs.skew)) + 9 * len(pairs.cross)
-    return _kernel(name, [W, z], repr(("hessian", parts, pairs, at_zero)), size, made, log, comm)
+    return _kernel(name, [W, z], repr(("hessian", parts, pairs, at_zero)), size, made, log)
 
 
-def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog, comm: MPI.Comm) -> PointKernel:
-    """Compile d2W/dz2 at z = 0: the rows of its upper triangle. All ranks of `comm` compile together."""
+def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog) -> PointKernel:
+    """Compile d2W/dz2 at z = 0: the rows of its upper triangle."""
     size = z.ufl_shape[0]
 
     def made(graph: Scalars, nodes: list[list[int]]) -> list[int]:
@@ -270,7 +276,7 @@ def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog, comm: MPI
         pairs = [(min(i, j), max(i, j)) for i, j in combinations_with_replacement(inputs, 2)]
         return graph.replaced([second.get(pair, graph.zero) for pair in pairs], dict.fromkeys(inputs, graph.zero))
 
-    return _kernel(name, [W, z], "whole hessian", size * (size + 1) // 2, made, log, comm)
+    return _kernel(name, [W, z], "whole hessian", size * (size + 1) // 2, made, log)
 
 
 NAME = "evaluate_many"

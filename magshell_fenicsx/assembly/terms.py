@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.following import PointField
-from magshell_fenicsx.assembly.kernels import Derived, KernelLog
+from magshell_fenicsx.assembly.kernels import Derived, KernelLog, itself
 from magshell_fenicsx.platform import compat
 
 Density = TypeVar("Density")  # the type of a form's density
@@ -101,15 +101,27 @@ class FormTerm:
 
     @cached_property
     def energy_form(self) -> fem.Form:
-        return self._log.compile(f"{self.name} energy", self.form)
+        return self._energy()
 
     @cached_property
     def residual_form(self) -> fem.Form:
-        return self._derived("residual", lambda: self._factor * self._gradient)
+        return self._residual()
 
     @cached_property
     def tangent_form(self) -> fem.Form | None:
-        return None if self.linear else self._derived("tangent", lambda: self._factor * self._symmetric)
+        return self._tangent() if self._tangent else None
+
+    @cached_property
+    def _energy(self) -> Callable[[], fem.Form]:
+        return self._log.begin(f"{self.name} energy", itself(self.form))
+
+    @cached_property
+    def _residual(self) -> Callable[[], fem.Form]:
+        return self._begin("residual", lambda: self._factor * self._gradient)
+
+    @cached_property
+    def _tangent(self) -> Callable[[], fem.Form] | None:
+        return None if self.linear else self._begin("tangent", lambda: self._factor * self._symmetric)
 
     @cached_property
     def skew_form(self) -> fem.Form | None:
@@ -120,12 +132,12 @@ class FormTerm:
             hessian = self._hessian
             return self._factor / 2 * (hessian - ufl.adjoint(hessian))
 
-        return self._derived("skew tangent", skew)
+        return self._begin("skew tangent", skew)()
 
-    def _derived(self, what: str, make: Callable[[], ufl.Form]) -> fem.Form:
+    def _begin(self, what: str, make: Callable[[], ufl.Form]) -> Callable[[], fem.Form]:
         of = self.form if self._work is None else self._work
         how = what if self._work is None else f"{what} of work"
-        return self._log.derived(f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,)))
+        return self._log.begin(f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,)))
 
     @property
     def _symmetric(self) -> ufl.Form:
@@ -151,7 +163,7 @@ class FormTerm:
         return float(fem.assemble_scalar(self.energy_form))
 
     def compile_residual(self) -> None:
-        _ = self.energy_form, self.residual_form
+        _ = self._energy, self._residual
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self.renew()
@@ -159,7 +171,7 @@ class FormTerm:
         fem.assemble_vector(b, self.residual_form)
 
     def compile_tangent(self) -> None:
-        _ = self.tangent_form
+        _ = self._tangent
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         if self.tangent_form is not None:

@@ -1,15 +1,22 @@
 """The calls that differ between dolfinx 0.9, 0.10 and 0.11; no other module depends on a version."""
 
+import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
+import cffi
+import ffcx
 import numpy as np
+import ufl
 from dolfinx import fem, mesh
 from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
 from dolfinx.fem.forms import form_cpp_class, get_integration_domains
+from ffcx import compiler, naming
+from ffcx.codegeneration import get_include_path, jit
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -22,13 +29,49 @@ NOT_A_NUMBER = (  # renamed by PETSc 3.25
 Field = TypeVar("Field")
 
 
+FORMS = cffi.FFI()  # the declarations of UFCx; pointers to complex numbers, which cffi lacks, are none of ours
+FORMS.cdef((jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL).replace("_Complex", ""))
+
+
+@cache
+def _form_options() -> dict[str, Any]:
+    return dict(ffcx.get_options({"scalar_type": np.float64}))
+
+
+def form_signature(form: ufl.Form) -> str:
+    """What the code of a form depends on."""
+    return str(naming.compute_signature([form], str(sorted(_form_options().items()))))
+
+
+def form_code(form: ufl.Form) -> str:
+    """The code of a form in C, as FFCx makes it."""
+    made = compiler.compile_ufl_objects([form], _form_options())
+    source = made[1] if isinstance(made[1], str) else made[0][1]  # lists of files, and their endings, from FFCx 0.10
+    return str(source)
+
+
+def form_include() -> str:
+    """The folder of the header that the code includes."""
+    return str(get_include_path())
+
+
 @dataclass(frozen=True)
 class Kernels:
     """A compiled form without mesh, fields and numbers."""
 
     ufcx: Any
-    module: Any
-    code: str | None
+    library: ctypes.CDLL
+
+    @classmethod
+    def of(cls, form: ufl.Form, library: ctypes.CDLL) -> "Kernels":
+        """Those of a form in the library that its code became."""
+        variable = ctypes.c_char.in_dll(library, naming.form_name(form, 0, ""))
+        return cls(FORMS.cast("ufcx_form*", ctypes.addressof(variable))[0], library)
+
+    @property
+    def ffi(self) -> cffi.FFI:
+        """What dolfinx asks of a module that cffi has made."""
+        return FORMS
 
     def in_order(self, fields: Sequence[Field]) -> list[Field]:
         """Those of a form that its kernels take, in their order."""
@@ -39,11 +82,6 @@ class Kernels:
         """The marks of the parts of the mesh that integrals of a kind are over; those over all of it have none."""
         first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
         return [mark for i in range(first, last) if (mark := self.ufcx.form_integral_ids[i]) != -1]
-
-
-def kernels_of(form: fem.Form) -> Kernels:
-    """What a form is made of."""
-    return Kernels(form.ufcx_form, form.module, form.code)
 
 
 def bound(
@@ -65,14 +103,14 @@ def bound(
     """
     kinds = {getattr(fem.IntegralType, name): tags for name, tags in marks.items()}
     parts = {kind: get_integration_domains(kind, tags, kernels.marked(kind)) for kind, tags in kinds.items()}
-    address = int(kernels.module.ffi.cast("uintptr_t", kernels.module.ffi.addressof(kernels.ufcx)))
+    address = int(FORMS.cast("uintptr_t", FORMS.addressof(kernels.ufcx)))
     objects = ([each._cpp_object for each in of] for of in (spaces, fields, numbers))
     make, given = form_cpp_class(np.float64), (*objects, parts)
     try:
         made = make(address, *given, {}, domain)
     except TypeError:
         made = make([address], *given, [], domain)  # of cells of several kinds, from dolfinx 0.10
-    return fem.Form(made, kernels.ufcx, kernels.code, kernels.module)
+    return fem.Form(made, kernels.ufcx, None, kernels)
 
 
 def shared_facets() -> Any:

@@ -1,4 +1,9 @@
-"""Shared libraries of C, compiled once and kept beside the kernels of the forms."""
+"""Shared libraries of C, compiled once, side by side, and kept for later processes.
+
+Of several processes that ask for a library one compiles it. A process holds the lock of a library only while it makes
+its code and a compiler runs, and waits for none meanwhile: whoever waits for another one's library waits for no more
+than that. So ranks share the work without a message: each takes what no other one has.
+"""
 
 import fcntl
 import hashlib
@@ -10,45 +15,172 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import IO
 
 from magshell_fenicsx.platform.kept import kept_file, kernel_cache
+from magshell_fenicsx.platform.processes import world
 
 FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
+POLL = 0.02  # s between two looks whether another process has made a library
+RENEWED = 0.5  # s after which it is told again how many there are
 VECTORS = ("avx2", "fma")  # of x86: what vectors of four numbers need to be one register
 
 
-def library(name: str, source: Callable[[], str], options: tuple[str, ...]) -> Path:
-    """The file of a library, which is compiled first if it is not there.
+class Library:
+    """A library: it is there, or is compiled meanwhile, by this process or another one.
 
     Parameters
     ----------
     name
-        Says what it depends on, but for the options and the processor.
+        Says what it depends on, but for the options.
     source
         Its code in C; called if it must be compiled.
     options
         Of the compiler.
+    """
+
+    def __init__(self, name: str, source: Callable[[], str], options: tuple[str, ...]) -> None:
+        depends = hashlib.sha256("\n".join((name, *options)).encode()).hexdigest()[:40]
+        self.file = f"libmagshell_{depends}.so"
+        self._source, self._options = source, options
+        self._work: Future[Path] | None = None
+        self._lock: IO[str] | None = None
+        self._kept = kept_file(self.file)
+
+    @property
+    def there(self) -> bool:
+        """Whether it can be loaded.
+
+        Raises
+        ------
+        RuntimeError
+            If the compiler has failed, or the folder of the kernels cannot be written.
+        """
+        if not self._kept and self._work and self._work.done():
+            self._kept = self._work.result()
+        elif not self._kept and not self._work:
+            self._kept = kept_file(self.file)
+        return self._kept is not None
+
+    @property
+    def work(self) -> "Future[Path] | None":
+        """The compilation by this process, while it lasts."""
+        return self._work if self._work and not self._work.done() else None
+
+    def start(self) -> None:
+        """Have it compiled, unless it is there or another process does so; returns at once.
+
+        Raises
+        ------
+        RuntimeError
+            If the folder of the kernels cannot be written.
+        """
+        if self.there or self._work or not self._take_lock():
+            return
+        try:
+            if not self.there:  # another process may have made it meanwhile
+                self._work = _pool().submit(self._compile, self._source())
+        finally:
+            if not self._work:
+                self._release_lock()
+
+    def path(self) -> Path:
+        """Its file, once it is there."""
+        side_by_side([self])
+        assert self._kept
+        return self._kept
+
+    def cancel(self) -> None:
+        """Give it up if no compiler runs yet."""
+        if self._work and self._work.cancel():
+            self._work = None
+            self._release_lock()
+
+    def _compile(self, source: str) -> Path:
+        try:
+            _compile(source, self._options, file := kernel_cache() / self.file)
+            return file
+        finally:
+            self._release_lock()
+
+    def _take_lock(self) -> bool:
+        """Lock out other processes; False if one has the lock. Where files cannot be locked, go on."""
+        folder = kernel_cache()
+        with written_into(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (folder / f"{self.file}.lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._lock.close()
+            return False
+        except OSError:
+            pass
+        return True
+
+    def _release_lock(self) -> None:
+        assert self._lock
+        self._lock.close()
+        Path(self._lock.name).unlink(missing_ok=True)
+
+
+def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lambda _: None) -> None:
+    """Compile libraries in their order, several at once, and return when all are there.
+
+    While compilers run, the code of one more is made; no more than that, so that other ranks find work.
+
+    Parameters
+    ----------
+    tell
+        Called again and again with the number of those that are there.
 
     Raises
     ------
     RuntimeError
-        If the compiler fails, or the folder of the kernels cannot be written.
+        If one cannot be compiled; those that have not begun are given up.
     """
-    options = (*options, *processor_options())
-    depends = hashlib.sha256("\n".join((name, *options)).encode()).hexdigest()[:40]
-    file, folder = f"libmagshell_{depends}.so", kernel_cache()
-    if kept := kept_file(file):
-        return kept
-    with written_into(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    with _alone(folder / f"{file}.lock"):
-        if not kept_file(file):  # another process may have made it meanwhile
-            _compile(source(), options, folder / file)
-    return folder / file
+    try:
+        while missing := [each for each in libraries if not each.there]:
+            tell(len(libraries) - len(missing))
+            for each in missing:
+                if not each.work and len(_running(missing)) <= cores():
+                    each.start()
+                    tell(sum(each.there for each in libraries))
+            if running := _running(missing):
+                wait(running, RENEWED, FIRST_COMPLETED)
+            else:
+                time.sleep(POLL)
+        tell(len(libraries))
+    except BaseException:
+        for each in libraries:
+            each.cancel()
+        raise
+
+
+def _running(libraries: Iterable[Library]) -> list["Future[Path]"]:
+    return [each.work for each in libraries if each.work]
+
+
+@cache
+def cores() -> int:
+    """How many compilers this process runs at once: ranks share the cores that they see."""
+    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, seen // int(world().size))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Threads that wait for compilers."""
+    return ThreadPoolExecutor(cores(), "compiler")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads stay behind
 
 
 @cache
@@ -80,32 +212,8 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
 
 
 @contextmanager
-def _alone(lock: Path) -> Iterator[None]:
-    """While another process has the lock, wait; where files cannot be locked, go on."""
-    with written_into(lock.parent), lock.open("w") as stream:
-        with suppress(OSError):
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
-    lock.unlink(missing_ok=True)
-
-
-def check_room(folder: Path) -> None:
-    """Say so if the disk is full, of the kernels or of temporary files: what dolfinx runs does not.
-
-    Raises
-    ------
-    RuntimeError
-        If a file of a megabyte cannot be written.
-    """
-    for place in (folder, tempfile.gettempdir()):
-        with written_into(folder), tempfile.TemporaryFile(dir=place) as stream:
-            stream.write(bytes(2**20))
-            stream.flush()
-
-
-@contextmanager
 def written_into(folder: Path) -> Iterator[None]:
-    """Turn an error of the disk into one that names the cache; dolfinx passes on only its words on several ranks."""
+    """Turn an error of the disk into one that names the cache."""
     try:
         yield
     except OSError as e:

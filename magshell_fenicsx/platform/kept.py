@@ -4,21 +4,15 @@ What is there is executed. So it is only taken from folders and files that the u
 change; where the usual folder is none, a private one takes its place.
 """
 
-import fcntl
 import grp
 import os
 import pwd
 import stat
 import tempfile
-import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-
-FORMS = "libffcx_forms_"  # how the names of dolfinx's begin
-COMPILING = "magshell_compiling_"  # how the name of a file begins that a process holds while it compiles
-UNFINISHED = 600  # s after which nobody compiles a form any more
 
 
 class UnsafeCache(RuntimeError):
@@ -42,7 +36,7 @@ def kept_file(name: str) -> Path | None:
     return next((folder / name for folder in folders if trusted(folder / name)), None)
 
 
-def trusted(file: "Path | os.DirEntry[str]") -> bool:
+def trusted(file: Path) -> bool:
     """Whether there is such a file, of the user or root, that nobody else may change."""
     try:
         about = file.stat()
@@ -73,30 +67,6 @@ def keep(name: str, content: bytes) -> None:
         return
 
 
-@contextmanager
-def compiling(folder: Path) -> Iterator[None]:
-    """While forms are compiled into a folder, which is held meanwhile: nothing unfinished is removed from it.
-
-    A file there remains if the process is killed.
-    """
-    with ExitStack() as stack:
-        with suppress(OSError):
-            stack.enter_context(_held(folder, fcntl.LOCK_SH))
-            stack.enter_context(tempfile.NamedTemporaryFile(dir=folder, prefix=COMPILING))
-        yield
-
-
-@contextmanager
-def _held(folder: Path, how: int) -> Iterator[None]:
-    """A folder locked: by all that compile into it together, or by one alone."""
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(number, how)
-        yield
-    finally:
-        os.close(number)
-
-
 def _usual() -> Path:
     from dolfinx.jit import get_options  # takes long to import
 
@@ -114,7 +84,6 @@ def _folders(usual: Path) -> tuple[Path, ...]:
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o755 if folder == usual else 0o700)
         if folder.is_dir() and os.access(folder, os.W_OK) and _is_private(folder):
-            _prepare(folder, also)
             return tuple(dict.fromkeys((folder, *also)))
     if also:
         return also  # has what was compiled before
@@ -122,56 +91,6 @@ def _folders(usual: Path) -> tuple[Path, ...]:
         f"kernel cache {usual}: others may write to it or own it, and what is in it is executed; no private folder can "
         "be made in its place: set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)"
     )
-
-
-def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
-    """Make a folder fit for dolfinx, which looks for forms in one folder and takes what it finds there.
-
-    What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
-    all others would wait. Forms of another folder are linked.
-    """
-    with _alone(folder) as alone:
-        with os.scandir(folder) as files:  # once: there may be thousands
-            kept = {file.name: file for file in files if file.name.startswith((FORMS, COMPILING))}
-        forms = {name: file for name, file in kept.items() if name.startswith(FORMS)}
-        strange = {name.split(".")[0] for name, file in forms.items() if not trusted(file)}
-        ready = (name.removesuffix(".cached") for name in forms if name.endswith(".c.cached"))
-        lost = [source for source in ready if source not in forms and not (folder / source).exists()]
-        strange |= {source.split(".")[0] for source in lost}  # FFCx would fail
-        marks = {name: file for name, file in kept.items() if alone and name not in forms}
-        with suppress(OSError):  # another program may remove one meanwhile
-            strange |= _unfinished(forms, marks) if alone else set()
-        _remove(folder, [name for name in forms if name.split(".")[0] in strange] + [*marks])
-    for other in also:
-        for file in other.glob(f"{FORMS}*") if other != folder else ():
-            if trusted(file):
-                with suppress(FileExistsError):
-                    (folder / file.name).symlink_to(file)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[bool]:
-    """Whether nothing of ours compiles into a folder, which is then held meanwhile."""
-    with ExitStack() as stack:
-        alone = False
-        with suppress(OSError):
-            stack.enter_context(_held(folder, fcntl.LOCK_EX | fcntl.LOCK_NB))
-            alone = True
-        yield alone
-
-
-def _unfinished(forms: Mapping[str, "os.DirEntry[str]"], marks: Mapping[str, "os.DirEntry[str]"]) -> set[str]:
-    """Forms that killed processes left; another program leaves no mark, and has as long as any compilation."""
-    begun = min((mark.stat().st_mtime for mark in marks.values()), default=float("inf"))
-    late = time.time() - UNFINISHED
-    sources = {name: file for name, file in forms.items() if name.endswith(".c") and f"{name}.cached" not in forms}
-    written = {name.removesuffix(".c"): file.stat().st_mtime for name, file in sources.items()}
-    return {form for form, moment in written.items() if moment >= begun or moment < late}
-
-
-def _remove(folder: Path, names: Iterable[str]) -> None:
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
 
 
 def _candidates(usual: Path) -> Iterator[Path]:

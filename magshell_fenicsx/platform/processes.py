@@ -162,6 +162,26 @@ def from_first(comm: "MPI.Comm", do: Callable[[], T]) -> T:
     return result
 
 
+def raised_by_all(comm: "MPI.Comm", do: Callable[[], None]) -> None:
+    """Call `do` on every rank; collective.
+
+    Raises
+    ------
+    Exception
+        On every rank, the exception of the first rank where `do` raises one; there its own.
+    """
+    own = None
+    try:
+        do()
+    except Exception as e:
+        if comm.size == 1:
+            raise
+        own = e
+    for sent in comm.allgather(_pickled(own) if own else b"") if comm.size > 1 else ():
+        if sent:
+            raise own or pickle.loads(sent)[1]
+
+
 def _pickled(e: Exception) -> bytes:
     """An error for the other ranks: the same one if it can be pickled."""
     try:

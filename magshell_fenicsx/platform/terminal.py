@@ -51,6 +51,13 @@ def open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
+def plain(ranks: int) -> bool:
+    """Whether no line can be rewritten: standard output is no terminal, or there are several ranks."""
+    return (
+        ranks > 1 or bool(LAUNCHERS & os.environ.keys()) or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb"
+    )
+
+
 @contextmanager
 def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Two functions: the first prints a line, the second rewrites the status line.
@@ -59,7 +66,7 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     EACH seconds have passed without one, and again after as many more. The status line is erased
     after `with`, and also when SIGTERM ends the process.
     """
-    if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
+    if plain(ranks):
         yield from _plain(say)
         return
     foot = ""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from mpi4py import MPI
 
+from magshell_fenicsx.assembly.kernels import reported
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.modes import NoEigenpair
@@ -28,7 +29,7 @@ from magshell_fenicsx.output.store.folder import DiskError, by_first, given_fold
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform.environment import fast_blas
-from magshell_fenicsx.platform.terminal import COLUMNS, fitting
+from magshell_fenicsx.platform.terminal import COLUMNS, fitting, plain
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -165,11 +166,22 @@ def run(
         raise CaseError("out: a run is known again by what it writes of its case: give the problem a 'document'")
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
-    if folder is None:
-        return _run(problem, None, comm, say, tell, watch, start, pictures, resume=False)
-    with held_folder(folder, comm, make=not resume):
-        open_folder(folder, problem.document, comm, resume, overwrite)
-        return _run(problem, folder, comm, say, tell, watch, start, pictures, resume=resume)
+    with reported(_of_kernels(say, tell, start, apart=plain(comm.size))):
+        if folder is None:
+            return _run(problem, None, comm, say, tell, watch, start, pictures, resume=False)
+        with held_folder(folder, comm, make=not resume):
+            open_folder(folder, problem.document, comm, resume, overwrite)
+            return _run(problem, folder, comm, say, tell, watch, start, pictures, resume=resume)
+
+
+def _of_kernels(say: Say, tell: Say, start: float, *, apart: bool) -> Say:
+    """Tells how far kernels are; if `apart`, the first time in a line that stays: a pipe gets a status late."""
+    stays = iter([say] if apart else [])
+
+    def told(what: str) -> None:
+        next(stays, tell)(waiting(what, time.perf_counter() - start))
+
+    return told
 
 
 def _ignored(line: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.kernels import KernelLog, itself
 from magshell_fenicsx.assembly.moving import Lid, Pressed
 from magshell_fenicsx.assembly.parameters import Growing, Parameter, Settable, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -240,6 +240,7 @@ class MeridianModel(Thin):
             from magshell_fenicsx.shells.tee import tees_of_meridian
 
             self.tees = tees_of_meridian(self)
+        begun = self.kernels.begin("volume energy", itself(volume))
         self.system = FiniteElementSystem(
             self.u,
             [*terms, *self.touchings, *self.tees],
@@ -250,7 +251,7 @@ class MeridianModel(Thin):
             moving=moves,
             history=stiffnesses,
         )
-        self._volume = self.kernels.compile("volume energy", volume)
+        self._volume = begun()
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
 

@@ -296,7 +296,7 @@ class ShellModel(Thin):
             return FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart)
 
         gradients = serve(dense)
-        gradients.compile()
+        gradients.begin(energies=True)
         for term in dense:
             if not (self.growing and term.amplitude == "pressure"):  # whose form measures from the drawn placement
                 term.points = gradients

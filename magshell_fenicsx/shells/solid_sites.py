@@ -75,9 +75,7 @@ class Site:
             z = self._points.field(3 * PARTS) if term.density.work else self._u
             W = self._density(term, z)
             self._pairs[term.name] = pairs
-            self._hessians[term.name] = point_hessian(
-                term.name, W, z, PARTS, pairs, log, V.mesh.comm, at_zero=z is not self._u
-            )
+            self._hessians[term.name] = point_hessian(term.name, W, z, PARTS, pairs, log, at_zero=z is not self._u)
         wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.same})
         self._coupled = Pairs(tuple(wanted))
         self._contraction = Contraction(rule, self._coupled)

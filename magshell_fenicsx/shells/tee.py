@@ -96,10 +96,10 @@ class Tie:
         W = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
         self._kernels: Mapping[str, PointKernel] = {
-            "angle": point_values("T-junction angle", angle, log, self._comm),
-            "energy": point_values("T-junction energy", W, log, self._comm),
-            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log, self._comm),
-            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log, self._comm),
+            "angle": point_values("T-junction angle", angle, log),
+            "energy": point_values("T-junction energy", W, log),
+            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
+            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log),
         }
         self._placed = self._times(tangents, whole(r0))
         values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]

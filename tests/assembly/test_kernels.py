@@ -1,14 +1,18 @@
 """Forms that scenes share: compiled once, bound to the mesh, the fields and the numbers of each."""
 
+from pathlib import Path
 from typing import Any
 
-import dolfinx.jit
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly import kernels
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_kernels import Points, point_values
 from magshell_fenicsx.continuation.system import Skewed, State
+from magshell_fenicsx.platform import compat, kept
 from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -53,7 +57,30 @@ def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monke
     def refused(*given: Any, **options: Any) -> None:
         raise AssertionError("a form is compiled again")
 
-    monkeypatch.setattr(dolfinx.jit, "ffcx_jit", refused)
+    monkeypatch.setattr(compat, "form_signature", refused)
     again = _evaluated(other)
     assert all(np.array_equal(one, two) for one, two in zip(alone, again, strict=True))
     assert not np.allclose(alone[-1], first[-1], rtol=1e-2, atol=0)
+
+
+def test_what_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How many kernels are there, of all that were begun; nothing where all are there."""
+    monkeypatch.setattr(kept, "_usual", lambda: tmp_path)
+    monkeypatch.setattr(kernels, "SHORT", 0.0)
+    told, log = list[str](), KernelLog()
+
+    def values() -> list[float]:
+        points = Points(1)
+        z = points.field(1)
+        z.x.array[:] = 0.5
+        begun = [point_values(f"{power}", z[0] ** power * ufl.as_vector([1.0]), log) for power in (2, 3, 4)]
+        with kernels.reported(told.append):
+            return [float(points.evaluate(each, 1)[0, 0]) for each in begun]
+
+    assert values() == [0.25, 0.125, 0.0625]
+    assert told[0] == "compiling kernels (once) 0 of 3"
+    assert told[-1] == "compiling kernels (once) 3 of 3"
+    told.clear()
+    assert values() == [0.25, 0.125, 0.0625]
+    assert not told
+    assert log.names == ["2", "3", "4"] * 2

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -66,7 +65,7 @@ def test_against_numpy(name: str, count: int) -> None:
     a, b, constant = points.field(2), points.field(1), fem.Constant(points._mesh, 0.4)
     a.x.array[:], b.x.array[:] = random.random(22), 1 + random.random(11)
     here = points.constant(constant)
-    kernel = point_values(name, expression(a, b[0], here), KernelLog(), MPI.COMM_SELF)
+    kernel = point_values(name, expression(a, b[0], here), KernelLog())
     for value in (0.4, 0.7):
         constant.value = value
         found = points.evaluate(kernel, count)
@@ -107,11 +106,9 @@ def test_derivatives_against_ufl(name: str) -> None:
         )  # from dolfinx 0.10 with an axis of points
         return values
 
-    gradient = points.evaluate(point_gradient(name, [(W, z)], log, MPI.COMM_SELF), 7).copy()
+    gradient = points.evaluate(point_gradient(name, [(W, z)], log), 7).copy()
     assert gradient == pytest.approx(by_dolfinx(first), rel=1e-12, abs=1e-12)
-    blocks = points.evaluate(
-        point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, MPI.COMM_SELF, at_zero=False), 7
-    )
+    blocks = points.evaluate(point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, at_zero=False), 7)
     wanted = by_dolfinx(second).reshape(7, 2, 3, 2, 3)
     whole = blocks[:, :18].reshape(7, 6, 3)  # components (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2) of three pairs
     for number, (c, d) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
@@ -130,9 +127,9 @@ def test_what_is_not_picked_needs_no_derivative() -> None:
     z = points.field(3)
     z.x.array[:] = [-1, 0, 0, 4, 0, 0, 0, 0, 0, 9, 0, 0]
     W = ufl.conditional(ufl.gt(z[0], 0), ufl.sqrt(z[0]), 0.0) ** 2
-    gradient = points.evaluate(point_gradient("root", [(W, z)], log, MPI.COMM_SELF), 4).copy()
+    gradient = points.evaluate(point_gradient("root", [(W, z)], log), 4).copy()
     assert gradient[:, 0] == pytest.approx([0, 1, 0, 1])
-    hessian = points.evaluate(point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, MPI.COMM_SELF, at_zero=False), 4)
+    hessian = points.evaluate(point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, at_zero=False), 4)
     assert hessian == pytest.approx(0, abs=1e-15)
 
 
@@ -142,7 +139,7 @@ def test_at_zero() -> None:
     z, a = points.field(3), points.field(1)
     z.x.array[:], a.x.array[:] = 0.3, [1, 2, 3]
     W = a[0] * z[0] ** 2 / 2 + z[1] * z[2] * ufl.exp(z[0])
-    found = points.evaluate(point_hessian("zero", W, z, 1, Pairs(((0, 0),)), log, MPI.COMM_SELF, at_zero=True), 3)
+    found = points.evaluate(point_hessian("zero", W, z, 1, Pairs(((0, 0),)), log, at_zero=True), 3)
     assert found == pytest.approx(np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]]))
 
 
@@ -172,7 +169,7 @@ def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) 
         points = Points(1)
         a, b, c = points.field(2), points.field(2), fem.Constant(points._mesh, float(given[4]))
         a.x.array[:], b.x.array[:] = given[:2], given[2:4]
-        kernel = point_values("once", W(a, b, ufl.variable(c)), KernelLog(), MPI.COMM_SELF)
+        kernel = point_values("once", W(a, b, ufl.variable(c)), KernelLog())
         return float(points.evaluate(kernel, 1)[0, 0])
 
     def first(a: Expr, b: Expr, c: Expr) -> Expr:

@@ -1,7 +1,6 @@
 """Where kernels and what is kept beside them come from: nobody else may have put it there."""
 
 import os
-import threading
 from pathlib import Path
 
 import pytest
@@ -76,78 +75,25 @@ def test_an_image_is_read_by_any_user(tmp_path: Path, home: Path, monkeypatch: p
     """Kernels of root's that nobody else may write are taken; new ones go to a private folder."""
     image, own = folder(tmp_path / "image", 0o755), home / ".cache" / "magshell"
     (image / "kernel").write_bytes(b"compiled")
-    (image / "libffcx_forms_a.so").write_bytes(b"a form")
     monkeypatch.setattr(kept, "_usual", lambda: image)
     monkeypatch.setattr(kept.os, "getuid", lambda: 12345)
     monkeypatch.setattr(kept.os, "access", lambda path, how: path != image)
     monkeypatch.setattr(kept, "_candidates", lambda usual: iter([usual, own]))
     assert kept._folders(image) == (own, image)
     assert kept.recall("kernel") == b"compiled"
-    assert (own / "libffcx_forms_a.so").read_bytes() == b"a form"  # dolfinx looks in one folder
+    assert kept.kept_file("kernel") == image / "kernel"
     kept.keep("another", b"new")
     assert (own / "another").read_bytes() == b"new"
 
 
 def test_a_kernel_that_others_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not loaded: a form is removed with whatever lies beside it, before dolfinx finds it."""
+    """It is not loaded."""
     monkeypatch.setattr(kept, "_usual", lambda: tmp_path / "cache")
     made = folder(tmp_path / "cache", 0o755)
-    for name in ("strange", "own"):
-        for end in (".cpython.so", ".c", ".c.cached"):
-            (made / f"libffcx_forms_{name}{end}").touch()
-    (made / "libffcx_forms_strange.cpython.so").chmod(0o666)
     (made / "libmagshell.so").touch()
+    assert kept.kept_file("libmagshell.so") == made / "libmagshell.so"
     (made / "libmagshell.so").chmod(0o666)
     assert kept.kept_file("libmagshell.so") is None
-    ends = [file.name.removeprefix("libffcx_forms_") for file in sorted(made.glob("libffcx*"))]
-    assert ends == ["own.c", "own.c.cached", "own.cpython.so"]
-
-
-def test_a_form_that_was_never_finished(tmp_path: Path) -> None:
-    """A process was killed while it compiled: all others would wait ten minutes for it, and then fail."""
-    made, (old, new) = folder(tmp_path / "cache", 0o755), ("libffcx_forms_old.c", "libffcx_forms_new.c")
-    whole = ["libffcx_forms_whole.c", "libffcx_forms_whole.c.cached"]
-    for name in (old, new, *whole, "libffcx_forms_lost.c.cached"):
-        (made / name).touch()
-    os.utime(made / old, (1e9, 1e9))
-
-    def left() -> list[str]:
-        kept._prepare(made, ())
-        return sorted(file.name for file in made.glob("*.c*"))
-
-    assert left() == [new, *whole]  # another program may compile it, which leaves no mark
-    killed = made / f"{kept.COMPILING}killed"
-    killed.touch()
-    (made / new).touch()
-    with kept.compiling(made):  # what is new may be theirs
-        assert left() == [new, *whole]
-    assert left() == whole
-    assert not [*made.glob(f"{kept.COMPILING}*")]
-
-
-def test_a_form_begun_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever compiles waits while the folder is looked through: nothing new is taken for what was left."""
-    made = folder(tmp_path / "cache", 0o755)
-    (made / f"{kept.COMPILING}killed").touch()
-    (made / "libffcx_forms_left.c").touch()
-    begin = threading.Thread(target=compile_one, args=(made,))
-
-    def remove(folder: Path, names: list[str]) -> None:
-        begin.start()
-        begin.join(0.1)
-        assert begin.is_alive()
-        removed(folder, names)
-
-    removed = kept._remove
-    monkeypatch.setattr(kept, "_remove", remove)
-    kept._prepare(made, ())
-    begin.join()
-    assert [file.name for file in made.glob("*.c*")] == ["libffcx_forms_begun.c"]
-
-
-def compile_one(folder: Path) -> None:
-    with kept.compiling(folder):
-        (folder / "libffcx_forms_begun.c").touch()
 
 
 def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

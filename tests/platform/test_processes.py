@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import from_first, raised_by_all
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.files import AlreadyComplete
@@ -77,6 +77,13 @@ def what_cannot_be_sent() -> None:
         from_first(COMM, lambda: lambda: None)
 
 
+def what_one_rank_cannot() -> None:
+    """All ranks raise, also where the first has no error."""
+    with raised(OSError, "of the last"):
+        raised_by_all(COMM, failing(OSError("of the last")) if COMM.rank == COMM.size - 1 else lambda: None)
+    raised_by_all(COMM, lambda: None)
+
+
 def reads() -> None:
     space = Scene(ms.Case.load(PLATE)).model.V
     with raised(DiskError, "nowhere/checkpoint cannot be read: No such file"):
@@ -102,7 +109,7 @@ def a_folder(out: Path) -> None:
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)
 
 
-ALONE = (what_rank_0_gets, any_error, files, what_cannot_be_sent, reads, meshes)
+ALONE = (what_rank_0_gets, any_error, files, what_cannot_be_sent, what_one_rank_cannot, reads, meshes)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from ufl.core.expr import Expr
@@ -149,7 +148,7 @@ class _Site:
             for part in range(2):  # the cosine's and the sine's
                 v = [each[part] for each in both]
                 W = W + _added(e.density, start, moved, v, self._edge(r0), parameters)
-            kernels.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log, MPI.COMM_SELF))
+            kernels.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log))
         return kernels
 
     def _is_drawn(self, e: Energy) -> bool:

@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.algorithms import extract_coefficients
 from ufl.constantvalue import Zero
@@ -64,9 +63,6 @@ class PointGradient:
         covectors of the edge in the sides' own coordinates (see `kinematics.conormal`), the width.
     values
         Gives (points, 3) of a field that a density depends on.
-    comm
-        All its ranks compile together.
-
     """
 
     def __init__(
@@ -79,7 +75,6 @@ class PointGradient:
         geometry: Array,
         values: Callable[[fem.Function], Array],
         log: KernelLog,
-        comm: MPI.Comm,
     ) -> None:
         self._size = terms[0].density.sides * len(parts) * 3
         chunk = max(CHUNK // each, 1) * each
@@ -87,7 +82,7 @@ class PointGradient:
         points = self._points = Points(max(min(count, chunk), 1))
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
         self._given = [_Given(placement, r0), _Given(place, Follows(lambda: geometry, tuple))]
-        self._names, self._log, self._comm = [term.name for term in terms], log, comm
+        self._names, self._log = [term.name for term in terms], log
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
@@ -103,14 +98,14 @@ class PointGradient:
         """The kernel of `evaluate`; None if nothing depends on u."""
         sums = [(sum(self._conservative, ufl.zero()), self._u), (sum(self._work, ufl.zero()), self._v)]
         sums = [(W, z) for W, z in sums if z in extract_coefficients(W)]
-        return point_gradient(f"{', '.join(self._names)} gradient", sums, self._log, self._comm) if sums else None
+        return point_gradient(f"{', '.join(self._names)} gradient", sums, self._log) if sums else None
 
     def energy(self, name: str) -> PointKernel | None:
         """The kernel of a term's energy; None if that is zero."""
         if name not in self._energies:
             W = self._W[self._names.index(name)]
             none = isinstance(W, Zero)
-            self._energies[name] = None if none else point_values(f"{name} energy", W, self._log, self._comm)
+            self._energies[name] = None if none else point_values(f"{name} energy", W, self._log)
         return self._energies[name]
 
     def chunks(self) -> list[slice]:

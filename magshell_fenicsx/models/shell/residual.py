@@ -88,10 +88,10 @@ class FastResidual:
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
 
-    def compile(self) -> None:
-        """Compile the kernels of the residual; collective."""
+    def begin(self, *, energies: bool = False) -> None:
+        """Begin the kernels of the residual, and those of the energies if they will be asked for."""
         for site in self._sites:
-            site.compile()
+            site.begin(energies=energies)
 
     def energy(self, name: str) -> float:
         """That of a term on this rank's part, at the present u; collective at first."""
@@ -129,11 +129,11 @@ class _Cells:
 
         placed = Follows(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
-            terms, parts, each, count, placed, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
+            terms, parts, each, count, placed, geometry, lambda field: at_points(field, X, cells), log
         )
 
-    def compile(self) -> None:
-        _ = self._points.gradient
+    def begin(self, *, energies: bool) -> None:
+        _ = self._points.gradient, [self._points.energy(name) for name in self.names if energies]
 
     def energy(self, nodal: Array, name: str) -> float:
         if (kernel := self._points.energy(name)) is None:
@@ -197,12 +197,12 @@ class _Edges:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
             at_cells = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
-            points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log, V.mesh.comm)
+            points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log)
             self._on[term.name] = rows, points
 
-    def compile(self) -> None:
-        for _, points in self._on.values():
-            _ = points.gradient
+    def begin(self, *, energies: bool) -> None:
+        for name, (_, points) in self._on.items():
+            _ = points.gradient, points.energy(name) if energies else None
 
     def energy(self, nodal: Array, name: str) -> float:
         self._sheet.at_points(nodal, self._there)
@@ -298,7 +298,7 @@ def point_parameters(
     for name, p in constants.items():
         of_terms = slopes(p, terms, f"by {name}", serve)
         for served in {id(slope.points): slope.points for slope in of_terms}.values():
-            served.compile()
+            served.begin()
         parameters[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
     return parameters
 

@@ -13,7 +13,6 @@ from operator import or_
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.batches import Batch, Blocks, Contraction
@@ -65,7 +64,7 @@ class Site:
         self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
         self._replaced = False
         for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
-            kernel.compile(self._u, self._r0, self._geometry, sides, log, V.mesh.comm)
+            kernel.begin(self._u, self._r0, self._geometry, sides, log)
         self.coupling = batches if sides == 2 else []
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
         pairs = Pairs(tuple(sorted(pairs.same, key=_neighbours)), pairs.cross)
@@ -139,10 +138,8 @@ class Kernel:
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
         self._varying = [(target, on_batches(field, batches, density.sides)) for target, field in varying]
 
-    def compile(
-        self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
-    ) -> None:
-        """Collective."""
+    def begin(self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog) -> None:
+        """Declare the kernel."""
         density, name, of_v = self._density, self._name, self._of_v
         self.pairs = _pairs(density)
         z = self._points.field(3 * PARTS) if of_v else u
@@ -151,7 +148,7 @@ class Kernel:
         W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
         if density.work:  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
             W = ufl.dot(ufl.diff(W, u), z) / 2
-        self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
+        self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, at_zero=of_v)
 
     def vary(self, number: int, values: Array) -> None:
         """Give the first parameter that varies its values at the points of a batch."""
