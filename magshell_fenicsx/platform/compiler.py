@@ -41,14 +41,16 @@ class Library:
         Says what it depends on, but for the options.
     source
         Its code in C; called if it must be compiled.
-    options
-        Of the compiler.
+    options, gnu_options
+        Of any compiler, and more of GCC itself.
     """
 
-    def __init__(self, name: str, source: Callable[[], str], options: tuple[str, ...]) -> None:
-        depends = hashlib.sha256("\n".join((name, *options)).encode()).hexdigest()[:40]
+    def __init__(
+        self, name: str, source: Callable[[], str], options: tuple[str, ...], gnu_options: tuple[str, ...] = ()
+    ) -> None:
+        depends = hashlib.sha256("\n".join((name, *options, *gnu_options)).encode()).hexdigest()[:40]
         self.file = f"libmagshell_{depends}.so"
-        self._source, self._options = source, options
+        self._source, self._options, self._gnu_options = source, options, gnu_options
         self._work: Future[Path] | None = None
         self._lock: IO[str] | None = None
         self._kept = kept_file(self.file)
@@ -104,7 +106,8 @@ class Library:
 
     def _compile(self, source: str) -> Path:
         try:
-            _compile(source, self._options, file := kernel_cache() / self.file)
+            options = (*self._options, *(self._gnu_options if self._gnu_options and is_gnu() else ()))
+            _compile(source, options, file := kernel_cache() / self.file)
             return file
         finally:
             self._release_lock()

@@ -1,20 +1,20 @@
 """The package's C code, compiled once into the folder of the kernels."""
 
-import hashlib
-import importlib.util
-import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cffi
 from mpi4py import MPI
 
-from magshell_fenicsx.platform.kept import kept_file, kernel_cache
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.compiler import Library
+from magshell_fenicsx.platform.processes import raised_by_all
 
-OPTIONS = ["-O3", "-g0", "-fschedule-insns", "-fsched-pressure"]  # sums over pairs: a sixth faster
-PRELUDE = """#include <stdint.h>
+OPTIONS = ("-O3", "-g0", "-DNDEBUG", "-fno-strict-overflow", "-std=gnu17")
+GNU_OPTIONS = ("-fschedule-insns", "-fsched-pressure")  # of GCC alone: sums over pairs are a sixth faster
+PRELUDE = """#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -25,42 +25,16 @@ PRELUDE = """#include <stdint.h>
 
 
 def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tuple[Any, Any]:
-    """The cffi objects (ffi, lib) of a C file, and what is `behind` it, compiled by rank 0 on first use. Collective.
+    """Return the cffi objects (ffi, lib) of a C file and of what is `behind` it, compiled on first use. Collective.
 
     Raises
     ------
     RuntimeError
-        On all ranks, if it cannot be compiled.
+        On all ranks, if it cannot be compiled; `NoCompiler` if nothing could be.
     """
     text = PRELUDE + "".join(each.read_text(encoding="utf-8") for each in (source, *behind))
-    key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
-    name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
-
-    def compiled() -> Path:
-        if kept := kept_file(f"{name}.so"):
-            return kept
-        try:
-            _compile(name, folder, text, declarations)
-        except (OSError, cffi.VerificationError) as e:
-            raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
-        return folder / f"{name}.so"
-
-    library = from_first(comm, compiled)
-    spec = importlib.util.spec_from_file_location(name, library)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.ffi, module.lib
-
-
-def _compile(name: str, folder: Path, text: str, declarations: str) -> None:
-    """Compile NAME.so into a folder, atomically even if other processes do the same."""
-    folder.mkdir(parents=True, exist_ok=True)
-    builder = cffi.FFI()
-    builder.cdef(declarations)
-    builder.set_source(name, text, extra_compile_args=OPTIONS)
-    with TemporaryDirectory(dir=folder) as scratch:
-        made = Path(builder.compile(tmpdir=scratch))
-        made.chmod(0o755)  # whatever the umask: what others may write is not trusted
-        made.replace(folder / f"{name}.so")
+    library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
+    raised_by_all(comm, lambda: library.path())
+    ffi = cffi.FFI()
+    ffi.cdef(declarations)
+    return ffi, ffi.dlopen(str(library.path()))
