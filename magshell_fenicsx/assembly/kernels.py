@@ -18,7 +18,7 @@ from ufl.algorithms.analysis import has_type
 from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.platform.compiler import check_room, library
+from magshell_fenicsx.platform.compiler import check_room, for_extensions, library
 from magshell_fenicsx.platform.kept import compiling, kernel_cache
 from magshell_fenicsx.platform.processes import from_first
 
@@ -144,7 +144,7 @@ class KernelLog:
     def _compiled(self, name: str, expression: ufl.Form) -> fem.Form:
         start, folder = time.perf_counter(), kernel_cache()
         try:
-            with compiling(folder):
+            with compiling(folder), for_extensions():
                 form = fem.form(expression, jit_options={**JIT_OPTIONS, "cache_dir": folder})
         except (OSError, cffi.VerificationError):
             check_room(folder)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import cache
 from types import TracebackType
 
 import numpy as np
@@ -59,7 +60,7 @@ class Factorisation:
         self._mumps: PETSc.PC | None = None
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
-        self._definite = self._has_cholmod = comm.size == 1
+        self._definite = self._has_cholmod = comm.size == 1 and has_cholmod()
         self._calm = 0  # successive matrices of MUMPS without a negative pivot
         self._edge: Edge | None = None
         self._edged: Edged | None = None
@@ -274,13 +275,18 @@ class Factorisation:
         return solutions
 
 
+@cache
 def has_cholmod() -> bool:
-    """Whether PETSc was built with CHOLMOD."""
-    K = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
+    """Whether PETSc was built with CHOLMOD, whose options it would call unused without."""
+    K = PETSc.Mat().createSBAIJ([1, 1], 1, nnz=1, comm=MPI.COMM_SELF)
     K.setValue(0, 0, 1.0)
     K.assemble()
+    pc = PETSc.PC().create(K.comm)
+    pc.setOperators(K)
+    pc.setType("cholesky")
+    pc.setFactorSolverType("cholmod")
     try:
-        _Definite(K).factor()
+        pc.setFactorSetUpSolverType()
     except PETSc.Error as e:
         if e.ierr != MISSING:
             raise

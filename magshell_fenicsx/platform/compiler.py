@@ -1,4 +1,7 @@
-"""Shared libraries of C, compiled once and kept beside the kernels of the forms."""
+"""The C compiler, and shared libraries of C, compiled once and kept beside the kernels of the forms.
+
+The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's, which PyPI has.
+"""
 
 import fcntl
 import hashlib
@@ -6,6 +9,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -13,12 +17,101 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from magshell_fenicsx.platform.kept import kept_file, kernel_cache
+from magshell_fenicsx.platform.packages import Unusable
 
 FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
 VECTORS = ("avx2", "fma")  # of x86: what vectors of four numbers need to be one register
+
+USUAL = ("cc", "gcc", "clang")
+# For any processor, as the kernels may be shared; and without traps for undefined behaviour, which it adds by default.
+ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
+HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
+SMALLEST = "#include <math.h>\n#include <Python.h>\n"  # what each kernel includes
+
+
+class NoCompiler(Unusable):
+    """There is no C compiler that can compile kernels."""
+
+
+def c_compiler() -> tuple[str, ...]:
+    """The command of the C compiler.
+
+    Raises
+    ------
+    NoCompiler
+        If there is none.
+    """
+    if given := os.environ.get("CC"):
+        command = tuple(shlex.split(given))
+        if not command or not shutil.which(command[0]):
+            raise NoCompiler(f"CC={given}: there is no such compiler; {HINT}")
+        return command
+    for name in (sysconfig.get_config_var("CC"), *USUAL):
+        command = tuple(shlex.split(name or ""))
+        if command and shutil.which(command[0]):
+            return command
+    if find_spec("ziglang"):
+        return sys.executable, "-m", "ziglang", "cc", *ZIG_OPTIONS
+    raise NoCompiler(f"there is no C compiler, which the kernels take: {HINT}")
+
+
+def is_gnu(compiler: tuple[str, ...]) -> bool:
+    """Whether a compiler is GCC itself; others say so too, but are Clang."""
+    command = [*compiler, "-dM", "-E", "-x", "c", os.devnull]
+    macros = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False).stdout
+    return "__GNUC__" in macros and "__clang__" not in macros
+
+
+@contextmanager
+def for_extensions() -> Iterator[None]:
+    """While extensions of Python are compiled, which setuptools does for cffi: it is told the compiler.
+
+    Raises
+    ------
+    NoCompiler
+        In place of any error, if there is none or it cannot compile the smallest extension.
+    """
+    told = dict[str, str]()
+    with suppress(NoCompiler):  # what is compiled already needs none
+        command = c_compiler()
+        if shlex.join(command) != (sysconfig.get_config_var("CC") or ""):
+            told = {"CC": shlex.join(command), "LDSHARED": shlex.join([*command, "-shared"])}
+            told = {name: value for name, value in told.items() if name not in os.environ}
+    os.environ.update(told)
+    try:
+        yield
+    except Exception:
+        refuse_unusable()
+        raise
+    finally:
+        for name in told:
+            os.environ.pop(name, None)
+
+
+def refuse_unusable() -> None:
+    """Refuse a compiler that cannot compile the smallest extension of Python.
+
+    Raises
+    ------
+    NoCompiler
+        With the compiler's first error.
+    """
+    command = c_compiler()
+    with tempfile.TemporaryDirectory() as scratch:
+        code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
+        code.write_text(SMALLEST, encoding="utf-8")
+        headers = f"-I{sysconfig.get_path('include')}"
+        words = [*command, headers, "-fPIC", "-shared", str(code), "-o", str(made)]
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+    if done.returncode and not FULL.search(done.stderr):
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        error = next((line for line in lines if "error" in line), lines[0]).replace(f"{scratch}/", "")
+        lacking = "the headers of Python (python3-dev) and" if "Python.h" in error else "its parts, or"
+        raise NoCompiler(f"{shlex.join(command)} compiles no kernel: {error}; install {lacking} another compiler: {HINT}")
 
 
 def library(name: str, source: Callable[[], str], options: tuple[str, ...]) -> Path:
@@ -35,8 +128,12 @@ def library(name: str, source: Callable[[], str], options: tuple[str, ...]) -> P
 
     Raises
     ------
+    NoCompiler
+        If there is none.
     RuntimeError
-        If the compiler fails, or the folder of the kernels cannot be written.
+        If the folder of the kernels cannot be written.
+    CalledProcessError
+        If the compiler fails.
     """
     options = (*options, *processor_options())
     depends = hashlib.sha256("\n".join((name, *options)).encode()).hexdigest()[:40]
@@ -65,7 +162,7 @@ def processor_options() -> tuple[str, ...]:
 
 def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     """Under a name of its own first, so that others find a whole library or none."""
-    compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    compiler = c_compiler()
     with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")

@@ -10,10 +10,12 @@ from typing import Any
 import cffi
 from mpi4py import MPI
 
+from magshell_fenicsx.platform.compiler import c_compiler, for_extensions, is_gnu
 from magshell_fenicsx.platform.kept import kept_file, kernel_cache
 from magshell_fenicsx.platform.processes import from_first
 
-OPTIONS = ["-O3", "-g0", "-fschedule-insns", "-fsched-pressure"]  # sums over pairs: a sixth faster
+OPTIONS = ["-O3", "-g0"]
+GNU_OPTIONS = ["-fschedule-insns", "-fsched-pressure"]  # of GCC alone: sums over pairs are a sixth faster
 PRELUDE = """#include <stdint.h>
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FAST __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
@@ -30,17 +32,18 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
     Raises
     ------
     RuntimeError
-        On all ranks, if it cannot be compiled.
+        On all ranks, if it cannot be compiled; `NoCompiler` if nothing could be.
     """
     text = PRELUDE + "".join(each.read_text(encoding="utf-8") for each in (source, *behind))
-    key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
+    key = hashlib.sha256(repr((text, declarations, [*OPTIONS, *GNU_OPTIONS], sys.version, cffi.__version__)).encode()).hexdigest()[:16]
     name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 
     def compiled() -> Path:
         if kept := kept_file(f"{name}.so"):
             return kept
         try:
-            _compile(name, folder, text, declarations)
+            with for_extensions():
+                _compile(name, folder, text, declarations)
         except (OSError, cffi.VerificationError) as e:
             raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
         return folder / f"{name}.so"
@@ -59,7 +62,8 @@ def _compile(name: str, folder: Path, text: str, declarations: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     builder = cffi.FFI()
     builder.cdef(declarations)
-    builder.set_source(name, text, extra_compile_args=OPTIONS)
+    options = [*OPTIONS, *(GNU_OPTIONS if is_gnu(c_compiler()) else ())]
+    builder.set_source(name, text, extra_compile_args=options)
     with TemporaryDirectory(dir=folder) as scratch:
         made = Path(builder.compile(tmpdir=scratch))
         made.chmod(0o755)  # whatever the umask: what others may write is not trusted

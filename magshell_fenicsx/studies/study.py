@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 from mpi4py import MPI
@@ -152,7 +151,7 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
         raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
     if repeat < 1 or not ranks or min(ranks) < 1:
         raise CaseError("--repeat and --ranks must be at least 1")
-    if max(ranks) > 1 and not which("mpirun"):
+    if max(ranks) > 1 and not mpirun_itself():
         raise CaseError("--ranks: there is no mpirun to start more than one")
     if reference is not None and not isfinite(reference):
         raise CaseError(f"--reference {reference}: must be a finite number")
