@@ -20,7 +20,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from magshell_fenicsx.platform.kept import kept_file, kernel_cache
+from magshell_fenicsx.platform.kept import keep, kept_file, kernel_cache, recall
 from magshell_fenicsx.platform.packages import Unusable
 
 FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
@@ -30,7 +30,9 @@ USUAL = ("cc", "gcc", "clang")
 # For any processor, as the kernels may be shared; and without traps for undefined behaviour, which it adds by default.
 ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
 HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
-SMALLEST = "#include <math.h>\n#include <Python.h>\n"  # what each kernel includes
+SMALLEST = "#include <math.h>\n#include <Python.h>\nvoid *none(void) { return Py_None; }\n"
+STAND_IN = Path(__file__).with_name("headers")  # for those of Python, which many systems package apart
+CHECKED = "magshell_compiler_checked"  # of a cache for which a compiler has compiled
 
 
 class NoCompiler(Unusable):
@@ -38,24 +40,26 @@ class NoCompiler(Unusable):
 
 
 def c_compiler() -> tuple[str, ...]:
-    """The command of the C compiler.
+    """The command of the C compiler, with a place for the headers of Python where they are not installed.
 
     Raises
     ------
     NoCompiler
         If there is none.
     """
+    headers = Path(sysconfig.get_path("include"))
+    also = () if (headers / "Python.h").is_file() else (f"-I{STAND_IN}",)
     if given := os.environ.get("CC"):
         command = tuple(shlex.split(given))
         if not command or not shutil.which(command[0]):
             raise NoCompiler(f"CC={given}: there is no such compiler; {HINT}")
-        return command
+        return *command, *also
     for name in (sysconfig.get_config_var("CC"), *USUAL):
         command = tuple(shlex.split(name or ""))
         if command and shutil.which(command[0]):
-            return command
+            return *command, *also
     if find_spec("ziglang"):
-        return sys.executable, "-m", "ziglang", "cc", *ZIG_OPTIONS
+        return sys.executable, "-m", "ziglang", "cc", *ZIG_OPTIONS, *also
     raise NoCompiler(f"there is no C compiler, which the kernels take: {HINT}")
 
 
@@ -75,21 +79,36 @@ def for_extensions() -> Iterator[None]:
     NoCompiler
         In place of any error, if there is none or it cannot compile the smallest extension.
     """
-    told = dict[str, str]()
+    before = {name: os.environ.get(name) for name in ("CC", "LDSHARED")}
     with suppress(NoCompiler):  # what is compiled already needs none
-        command = c_compiler()
-        if shlex.join(command) != (sysconfig.get_config_var("CC") or ""):
-            told = {"CC": shlex.join(command), "LDSHARED": shlex.join([*command, "-shared"])}
-            told = {name: value for name, value in told.items() if name not in os.environ}
-    os.environ.update(told)
+        command = shlex.join(c_compiler())
+        if command not in (before["CC"], None if before["CC"] else sysconfig.get_config_var("CC")):
+            os.environ["CC"] = command
+            os.environ.setdefault("LDSHARED", f"{command} -shared")
     try:
         yield
     except Exception:
         refuse_unusable()
         raise
     finally:
-        for name in told:
-            os.environ.pop(name, None)
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def check_compiler() -> None:
+    """Refuse a compiler that cannot compile kernels, before any is compiled; a cache that has some needs none.
+
+    Raises
+    ------
+    NoCompiler
+        With the compiler's first error, or if there is none.
+    """
+    if recall(CHECKED) is None:
+        refuse_unusable()
+        keep(CHECKED, b"yes")
 
 
 def refuse_unusable() -> None:
@@ -104,14 +123,12 @@ def refuse_unusable() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
         code.write_text(SMALLEST, encoding="utf-8")
-        headers = f"-I{sysconfig.get_path('include')}"
-        words = [*command, headers, "-fPIC", "-shared", str(code), "-o", str(made)]
+        words = [*command, f"-I{sysconfig.get_path('include')}", "-fPIC", "-shared", str(code), "-o", str(made)]
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode and not FULL.search(done.stderr):
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         error = next((line for line in lines if "error" in line), lines[0]).replace(f"{scratch}/", "")
-        lacking = "the headers of Python (python3-dev) and" if "Python.h" in error else "its parts, or"
-        raise NoCompiler(f"{shlex.join(command)} compiles no kernel: {error}; install {lacking} another compiler: {HINT}")
+        raise NoCompiler(f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}")
 
 
 def library(name: str, source: Callable[[], str], options: tuple[str, ...]) -> Path:
