@@ -35,7 +35,9 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
         On all ranks, if it cannot be compiled; `NoCompiler` if nothing could be.
     """
     text = PRELUDE + "".join(each.read_text(encoding="utf-8") for each in (source, *behind))
-    key = hashlib.sha256(repr((text, declarations, [*OPTIONS, *GNU_OPTIONS], sys.version, cffi.__version__)).encode()).hexdigest()[:16]
+    key = hashlib.sha256(
+        repr((text, declarations, [*OPTIONS, *GNU_OPTIONS], sys.version, cffi.__version__)).encode()
+    ).hexdigest()[:16]
     name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 
     def compiled() -> Path:

@@ -13,6 +13,7 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version, fingerprint
+from magshell_fenicsx.platform.processes import mpirun_itself
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.measured import Timings, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source

@@ -12,6 +12,8 @@
 #include <sys/types.h>
 #include <wchar.h>
 
+#define PY_MAJOR_VERSION 3
+
 typedef ssize_t Py_ssize_t;
 typedef struct _object PyObject;
 typedef struct _ts PyThreadState;
