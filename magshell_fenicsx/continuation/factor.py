@@ -58,6 +58,7 @@ class Factorisation:
         self.comm = comm
         self._cholmod: _Definite | None = None
         self._mumps: PETSc.PC | None = None
+        self._entries = 0.0  # of its matrix
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
         self._definite = self._has_cholmod = comm.size == 1 and has_cholmod()
@@ -177,8 +178,9 @@ class Factorisation:
         return True
 
     def _factor_any(self, K: PETSc.Mat) -> None:
-        if self._mumps is None or self._mumps.getOperators()[1].handle != K.handle:  # another pattern has new factors
-            self._mumps = _new_pc(K, "mumps")
+        entries = _entries(K)
+        if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (K.handle, entries):
+            self._mumps, self._entries = _new_pc(K, "mumps"), entries  # of another pattern PETSc drops the options below
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
             F.setMumpsIcntl(24, 1)  # report null pivots: PETSc gives no inertia without this
@@ -323,7 +325,8 @@ class _Definite:
 
 
 def _entries(K: PETSc.Mat) -> float:
-    return float(K.getInfo()["nz_used"])
+    """All entries of its pattern; collective."""
+    return float(K.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])
 
 
 def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:

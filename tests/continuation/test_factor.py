@@ -106,7 +106,10 @@ def test_blocks(bs: int) -> None:
             assert factors.negative_pivots == negative
 
 
-def test_another_matrix_or_another_pattern() -> None:
+@pytest.mark.parametrize("definite", [True, False])
+def test_another_matrix_or_another_pattern(monkeypatch: pytest.MonkeyPatch, definite: bool) -> None:
+    """By CHOLMOD, if it is there, and by MUMPS alone."""
+    monkeypatch.setattr(factor, "has_cholmod", lambda: definite and has_cholmod())
     factors = Factorisation(MPI.COMM_SELF)
     factors.factor(matrix([2.0, 4.0, 8.0]))
     K = matrix([1.0, 2.0, 4.0])
