@@ -180,7 +180,8 @@ class Factorisation:
     def _factor_any(self, K: PETSc.Mat) -> None:
         entries = _entries(K)
         if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (K.handle, entries):
-            self._mumps, self._entries = _new_pc(K, "mumps"), entries  # of another pattern PETSc drops the options below
+            # of another pattern PETSc makes new factors itself, without the options below
+            self._mumps, self._entries = _new_pc(K, "mumps"), entries
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
             F.setMumpsIcntl(24, 1)  # report null pivots: PETSc gives no inertia without this

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.platform.packages import gmsh_module
 
 Integers = NDArray[np.int64]
 Blocks = list[tuple[str, int, int, Integers]]
@@ -93,7 +94,7 @@ def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, 
 
 
 def _main(file: Path) -> None:
-    import gmsh
+    gmsh = gmsh_module()
 
     gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may run commands
     gmsh.option.setNumber("General.Terminal", 0)

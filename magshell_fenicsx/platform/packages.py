@@ -16,6 +16,9 @@ WAYS = (
 )
 
 
+LIBRARIES = "libglu1-mesa libgl1 libxrender1 libxcursor1 libxfixes3 libxft2 libxinerama1 libfontconfig1 libgomp1"
+
+
 class Unusable(RuntimeError):
     """What the program needs is missing on this machine, or is of another kind."""
 
@@ -34,6 +37,23 @@ def load_mpi_first() -> None:
     """Have MPI imported before dolfinx; takes no time until then."""
     if not OF_MPI & sys.modules.keys():
         sys.meta_path.insert(0, MpiFirst())
+
+
+def gmsh_module() -> Any:
+    """The package gmsh.
+
+    Raises
+    ------
+    Unusable
+        If a library of the system is missing that it takes.
+    """
+    try:
+        import gmsh
+    except OSError as e:
+        raise Unusable(
+            f"gmsh cannot be loaded: {e}: install that library, on Debian by apt install {LIBRARIES}"
+        ) from None
+    return gmsh
 
 
 def missing(e: ImportError) -> str | None:

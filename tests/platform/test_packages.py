@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import CASES
 
-from magshell_fenicsx.platform.packages import missing
+from magshell_fenicsx.platform.packages import Unusable, gmsh_module, missing
 
 
 @pytest.mark.parametrize("first", ["petsc4py.PETSc", "dolfinx", "magshell_fenicsx.continuation.factor"])
@@ -39,6 +40,15 @@ main()
     assert done.stderr.startswith(f"{name} cannot be imported")
     assert ".[dolfinx]" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_gmsh_without_the_libraries_of_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message names the library, and the packages that have it."""
+    (tmp_path / "gmsh.py").write_text('raise OSError("libGLU.so.1: no such file")', encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "gmsh", raising=False)
+    with pytest.raises(Unusable, match=r"^gmsh cannot be loaded: libGLU\.so\.1: .* apt install libglu1-mesa"):
+        gmsh_module()
 
 
 def test_a_package_that_pip_installs() -> None:
