@@ -48,7 +48,8 @@ def test_dependencies_agree() -> None:
     run = named(recipe()["requirements"]["run"])
     assert {name: bound for name, bound in run.items() if name not in OF_DOLFINX} == pip
     newest = re.search(r"<[\d.]+", named(extra)["dolfinx-solver-real"])
-    assert newest and newest[0] in run["fenics-dolfinx"].split(",")
+    assert newest
+    assert newest[0] in run["fenics-dolfinx"].split(",")
     assert {name: bound for name, bound in environment.items() if name != "pip"} == run
     assert recipe()["build"]["entry_points"] == [f"magshell = {PROJECT['scripts']['magshell']}"]
     assert set(recipe()["requirements"]["host"]) == {f"python {PROJECT['requires-python']}", "pip", "setuptools >=77"}

@@ -10,8 +10,8 @@ from conftest import CASES
 
 TOP = CASES.parent
 TOOLS = (  # all that a machine without anything has
-    "bash cat cksum echo cp cut dirname env find flock getconf grep head id mkdir mktemp mv readlink rm sed tail touch tr"
-    " uname xargs"
+    "bash cat cksum echo cp cut dirname env find flock getconf grep head id mkdir mktemp mv readlink rm sed tail touch"
+    " tr uname xargs"
 )
 ARGUMENTS = "#!/bin/sh\nprintf '%s\\n' \"$@\"\n"
 FAILS = "#!/bin/sh\nexit 1\n"
