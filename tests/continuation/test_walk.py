@@ -255,7 +255,7 @@ def test_modes_too_close_to_part_count_as_one(control: str) -> None:
     assert point.state.mu["load"] == pytest.approx(1.0, abs=1e-5)
 
 
-@pytest.mark.xfail(not has_cholmod(), reason="by MUMPS alone the bifurcation is found that a force of 1e-5 would restore")
+@pytest.mark.xfail(not has_cholmod(), reason="by MUMPS the bifurcation is found that a force of 1e-5 restores")
 def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
     """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends
     at a fold."""
