@@ -23,7 +23,7 @@ make studies          error against run time of two cases into docs/study/: 10 m
 make test             lint and the tests that are not marked slow: 10 minutes on two cores
                       (TESTS="tests/simulate ...": of these folders; MARK=slow, MARK=telling: those so marked;
                       LIMIT=seconds; OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor;
-                      ROOT=sid: on Debian unstable, without lint)
+                      ROOT=sid: on Debian unstable, ROOT=pypi: with the packages of PyPI, both without lint)
 make test-all         lint and all tests
 make lint             ruff and mypy
 make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
@@ -81,7 +81,7 @@ site:
 
 test: $(if $(ROOT),,lint)
 	$(CORE_TYPE)
-	$(ENV) $(LIMITED) $(PYTEST) -m '$(MARK)' $(if $(ROOT),tests/versions) $(TESTS)
+	$(ENV) $(LIMITED) $(PYTEST) -m '$(MARK)' $(if $(filter sid,$(ROOT)),tests/versions) $(TESTS)
 
 test-all: lint
 	$(ENV) $(LIMITED) $(PYTEST) $(TESTS)

@@ -15,6 +15,8 @@ whose `Free` parameters are amplitudes too.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from magshell_fenicsx.platform.packages import load_mpi_first
+
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.input.source import CaseError
@@ -107,6 +109,8 @@ _ROOMS = {
     "simulate.trace": "trace",
 }
 _WHERE = {name: f"{__name__}.{room}" for room, names in _ROOMS.items() for name in names.split()}
+
+load_mpi_first()
 
 
 def __getattr__(name: str) -> Any:

@@ -25,6 +25,7 @@ from magshell_fenicsx.command import (
     result_option,
     typer,
 )
+from magshell_fenicsx.platform.packages import Unusable, missing
 from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams
 
@@ -70,7 +71,12 @@ def main() -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
-    except Exception:
+    except Exception as e:
+        if isinstance(e, ImportError) and (advice := missing(e)):
+            print(advice, file=sys.stderr)
+            sys.exit(INVALID)
+        if isinstance(e, Unusable):
+            sys.exit(failure(str(e), INVALID).exit_code)
         if world().size == 1:
             raise
         traceback.print_exc()

@@ -15,6 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.kept import UnsafeCache
+from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
 _absent = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
@@ -203,7 +204,7 @@ def exit_codes(stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """
     try:
         yield
-    except (CaseError, MeshError, UnsafeCache) as e:
+    except (CaseError, MeshError, UnsafeCache, Unusable) as e:
         raise failure(str(e), INVALID) from None
     except stopped as e:
         raise failure(f"stopped early: {e}", STOPPED) from None

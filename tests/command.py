@@ -12,6 +12,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from magshell_fenicsx.cli import app
+from magshell_fenicsx.platform import processes
 
 NICE = ["nice", "-n", "-10"]
 # click before 8.2 mixes both streams by default
@@ -37,7 +38,7 @@ def mpirun(ranks: int) -> list[str]:
 
     Ranks poll while they wait for each other: beside another test they take several times as long if not first.
     """
-    return [*FIRST, "mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)]
+    return [*FIRST, *processes.mpirun(ranks)]
 
 
 def started(*arguments: str | Path | float, ranks: int = 0, pictures: bool = True) -> subprocess.CompletedProcess[str]:

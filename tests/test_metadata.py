@@ -28,7 +28,7 @@ def recipe() -> dict[str, Any]:
 
 def named(lines: list[Any]) -> dict[str, str]:
     """Names -> bounds, of lines such as "pydantic>=2.9"."""
-    parts = (re.match(r"([\w-]+)\s*(.*)", line) for line in lines if isinstance(line, str) and line != ".")
+    parts = (re.match(r"([\w-]+)\s*([^#]*\S|)", line) for line in lines if isinstance(line, str) and line != ".")
     return {CONDA.get(part[1], part[1]): part[2] for part in parts if part}
 
 
@@ -40,12 +40,16 @@ def test_one_version() -> None:
 
 def test_dependencies_agree() -> None:
     """Of pip, of the environment for conda, and of the recipe; bounds too."""
-    pip = named(PROJECT["dependencies"])
+    extra = PROJECT["optional-dependencies"]["dolfinx"]  # its other packages have other names on conda-forge
+    pip = named(PROJECT["dependencies"]) | {"setuptools": named(extra)["setuptools"]}
     dependencies = yaml.safe_load((TOP / "environment.yml").read_text(encoding="utf-8"))["dependencies"]
     (inner,) = (entry["pip"] for entry in dependencies if isinstance(entry, dict))
     environment = named(dependencies) | named(inner)
     run = named(recipe()["requirements"]["run"])
     assert {name: bound for name, bound in run.items() if name not in OF_DOLFINX} == pip
+    newest = re.search(r"<[\d.]+", named(extra)["dolfinx-solver-real"])
+    assert newest
+    assert newest[0] in run["fenics-dolfinx"].split(",")
     assert {name: bound for name, bound in environment.items() if name != "pip"} == run
     assert recipe()["build"]["entry_points"] == [f"magshell = {PROJECT['scripts']['magshell']}"]
     assert set(recipe()["requirements"]["host"]) == {f"python {PROJECT['requires-python']}", "pip", "setuptools >=77"}

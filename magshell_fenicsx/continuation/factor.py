@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import cache
 from types import TracebackType
 
 import numpy as np
@@ -57,9 +58,10 @@ class Factorisation:
         self.comm = comm
         self._cholmod: _Definite | None = None
         self._mumps: PETSc.PC | None = None
+        self._entries = 0.0  # of its matrix
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
-        self._definite = self._has_cholmod = comm.size == 1
+        self._definite = self._has_cholmod = comm.size == 1 and has_cholmod()
         self._calm = 0  # successive matrices of MUMPS without a negative pivot
         self._edge: Edge | None = None
         self._edged: Edged | None = None
@@ -176,8 +178,10 @@ class Factorisation:
         return True
 
     def _factor_any(self, K: PETSc.Mat) -> None:
-        if self._mumps is None or self._mumps.getOperators()[1].handle != K.handle:  # another pattern has new factors
-            self._mumps = _new_pc(K, "mumps")
+        entries = _entries(K)
+        if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (K.handle, entries):
+            # of another pattern PETSc makes new factors itself, without the options below
+            self._mumps, self._entries = _new_pc(K, "mumps"), entries
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
             F.setMumpsIcntl(24, 1)  # report null pivots: PETSc gives no inertia without this
@@ -274,13 +278,18 @@ class Factorisation:
         return solutions
 
 
+@cache
 def has_cholmod() -> bool:
-    """Whether PETSc was built with CHOLMOD."""
-    K = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
+    """Whether PETSc was built with CHOLMOD, whose options it would call unused without."""
+    K = PETSc.Mat().createSBAIJ([1, 1], 1, nnz=1, comm=MPI.COMM_SELF)
     K.setValue(0, 0, 1.0)
     K.assemble()
+    pc = PETSc.PC().create(K.comm)
+    pc.setOperators(K)
+    pc.setType("cholesky")
+    pc.setFactorSolverType("cholmod")
     try:
-        _Definite(K).factor()
+        pc.setFactorSetUpSolverType()
     except PETSc.Error as e:
         if e.ierr != MISSING:
             raise
@@ -317,7 +326,8 @@ class _Definite:
 
 
 def _entries(K: PETSc.Mat) -> float:
-    return float(K.getInfo()["nz_used"])
+    """All entries of its pattern; collective."""
+    return float(K.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])
 
 
 def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:

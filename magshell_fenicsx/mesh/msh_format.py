@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.platform.packages import Unusable, gmsh_module
 
 Integers = NDArray[np.int64]
 Blocks = list[tuple[str, int, int, Integers]]
 FOUND = "found"
+UNUSABLE = 4  # exit code where gmsh cannot be loaded
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ def parsed(content: bytes) -> Content:
         command = [sys.executable, "-m", __name__, str(alone)]
         env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])}
         done = subprocess.run(command, env=env, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode == UNUSABLE:
+            raise Unusable(done.stderr.strip())
         if done.returncode:
             reason = (done.stderr.strip().splitlines() or ["nothing"])[-1] if done.returncode > 0 else "it crashed"
             reason = reason.replace(str(alone), "the file").removeprefix("Exception: ").strip()
@@ -93,8 +97,11 @@ def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, 
 
 
 def _main(file: Path) -> None:
-    import gmsh
-
+    try:
+        gmsh = gmsh_module()
+    except Unusable as e:
+        print(e, file=sys.stderr)
+        sys.exit(UNUSABLE)
     gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may run commands
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.open(str(file))

@@ -12,6 +12,7 @@ from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import CLOSE
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh, place_text
 from magshell_fenicsx.mesh.shapes import Shape
+from magshell_fenicsx.platform.packages import gmsh_module
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -59,7 +60,7 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
 
 def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Array, Numbers, Numbers]:
     """Nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
-    import gmsh
+    gmsh = gmsh_module()
 
     gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may change meshes, and run commands
     try:

@@ -20,6 +20,13 @@ from ffcx.codegeneration import get_include_path, jit
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.platform.packages import Unusable
+
+if np.issubdtype(PETSc.ScalarType, np.complexfloating):
+    raise Unusable(
+        "this PETSc computes with complex numbers; the program takes one with real numbers: of PyPI's wheels "
+        "dolfinx-solver-real in place of dolfinx-solver"
+    )
 _Reason = PETSc.SNES.ConvergedReason
 NOT_A_NUMBER = (  # renamed by PETSc 3.25
     _Reason.DIVERGED_FNORM_NAN if hasattr(_Reason, "DIVERGED_FNORM_NAN") else _Reason.DIVERGED_FUNCTION_NANORINF

@@ -1,4 +1,6 @@
-"""Shared libraries of C, compiled once, side by side, and kept for later processes.
+"""The C compiler, and shared libraries of C, compiled once, side by side, and kept for later processes.
+
+The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's, which PyPI has.
 
 Of several processes that ask for a library one compiles it. A process holds the lock of a library only while it makes
 its code and a compiler runs, and waits for none meanwhile: whoever waits for another one's library waits for no more
@@ -11,6 +13,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -20,16 +23,92 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
 
-from magshell_fenicsx.platform.kept import kept_file, kernel_cache
+from magshell_fenicsx.platform.kept import keep, kept_file, kernel_cache, recall
+from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
 FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
 POLL = 0.02  # s between two looks whether another process has made a library
 RENEWED = 0.5  # s after which it is told again how many there are
 VECTORS = ("avx2", "fma")  # of x86: what vectors of four numbers need to be one register
+
+USUAL = ("cc", "gcc", "clang")
+# For any processor, as the kernels may be shared; and without traps for undefined behaviour, which it adds by default.
+ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
+HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
+SMALLEST = "#include <math.h>\ndouble root(double x) { return sqrt(x); }\n"
+CHECKED = "magshell_compiler_checked"  # of a cache for which a compiler has compiled
+
+
+class NoCompiler(Unusable):
+    """There is no C compiler that can compile kernels."""
+
+
+def c_compiler() -> tuple[str, ...]:
+    """Return the command of the C compiler.
+
+    Raises
+    ------
+    NoCompiler
+        If there is none.
+    """
+    if given := os.environ.get("CC"):
+        command = tuple(shlex.split(given))
+        if not command or not shutil.which(command[0]):
+            raise NoCompiler(f"CC={given}: there is no such compiler; {HINT}")
+        return command
+    for name in (sysconfig.get_config_var("CC"), *USUAL):
+        command = tuple(shlex.split(name or ""))
+        if command and shutil.which(command[0]):
+            return command
+    if find_spec("ziglang"):
+        return sys.executable, "-m", "ziglang", "cc", *ZIG_OPTIONS
+    raise NoCompiler(f"there is no C compiler, which the kernels take: {HINT}")
+
+
+@cache
+def is_gnu(compiler: tuple[str, ...]) -> bool:
+    """Whether a compiler is GCC itself; others say so too, but are Clang."""
+    command = [*compiler, "-dM", "-E", "-x", "c", os.devnull]
+    macros = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False).stdout
+    return "__GNUC__" in macros and "__clang__" not in macros
+
+
+def check_compiler() -> None:
+    """Refuse a compiler that cannot compile kernels, before any is compiled; a cache that has some needs none.
+
+    Raises
+    ------
+    NoCompiler
+        With the compiler's first error, or if there is none.
+    """
+    if recall(CHECKED) is None:
+        refuse_unusable()
+        keep(CHECKED, b"yes")
+
+
+def refuse_unusable() -> None:
+    """Refuse a compiler that cannot compile the smallest library.
+
+    Raises
+    ------
+    NoCompiler
+        With the compiler's first error.
+    """
+    command = c_compiler()
+    with tempfile.TemporaryDirectory() as scratch:
+        code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
+        code.write_text(SMALLEST, encoding="utf-8")
+        words = [*command, "-fPIC", "-shared", str(code), "-o", str(made), "-lm"]
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+    if done.returncode and not FULL.search(done.stderr):
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        error = next((line for line in lines if "error" in line), lines[0]).replace(f"{scratch}/", "")
+        raise NoCompiler(f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}")
 
 
 class Library:
@@ -106,7 +185,7 @@ class Library:
 
     def _compile(self, source: str) -> Path:
         try:
-            options = (*self._options, *(self._gnu_options if self._gnu_options and is_gnu() else ()))
+            options = (*self._options, *(self._gnu_options if self._gnu_options and is_gnu(c_compiler()) else ()))
             _compile(source, options, file := kernel_cache() / self.file)
             return file
         finally:
@@ -145,6 +224,8 @@ def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lam
 
     Raises
     ------
+    NoCompiler
+        If there is none.
     RuntimeError
         If one cannot be compiled; those that have not begun are given up.
     """
@@ -200,7 +281,7 @@ def processor_options() -> tuple[str, ...]:
 
 def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     """Under a name of its own first, so that others find a whole library or none."""
-    compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    compiler = c_compiler()
     with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")
@@ -209,6 +290,8 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
         print(done.stderr, end="", file=sys.stderr)
         if done.returncode and (full := FULL.search(done.stderr)):  # of its own, or of the folder for temporary files
             raise OSError(0, full[0])
+        if done.returncode:
+            refuse_unusable()
         done.check_returncode()
         made.chmod(0o755)  # whatever the umask: what others may write is not trusted
         made.replace(file)

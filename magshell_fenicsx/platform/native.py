@@ -29,10 +29,13 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
 
     Raises
     ------
+    NoCompiler
+        On all ranks, if there is no compiler.
     RuntimeError
-        On all ranks, if it cannot be compiled; `NoCompiler` if nothing could be.
+        On all ranks, if the folder of the kernels cannot be written.
     """
-    text = PRELUDE + "".join(each.read_text(encoding="utf-8") for each in (source, *behind))
+    texts = (f'#line 1 "{each.name}"\n{each.read_text(encoding="utf-8")}\n' for each in (source, *behind))
+    text = PRELUDE + "".join(texts)
     library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
     raised_by_all(comm, lambda: library.path())
     ffi = cffi.FFI()

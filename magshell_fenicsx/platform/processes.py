@@ -11,11 +11,13 @@ import os
 import pickle
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -75,6 +77,21 @@ class Usage:
         return (self.errors.strip().splitlines() or [""])[-1]
 
 
+@cache
+def mpirun_itself() -> str | None:
+    """The launcher of ranks: that beside this Python, as PyPI's MPI has it, or that of the system; None without."""
+    beside = Path(sys.executable).parent
+    return shutil.which("mpirun", path=f"{beside}{os.pathsep}{os.environ.get('PATH', os.defpath)}")
+
+
+@cache
+def mpirun(ranks: int) -> tuple[str, ...]:
+    """The words that start so many ranks, even if there are fewer cores; Open MPI must be told that."""
+    launcher = mpirun_itself() or "mpirun"
+    about = subprocess.run([launcher, "--version"], capture_output=True, text=True, check=False).stdout
+    return (launcher, *(("--map-by", ":OVERSUBSCRIBE") if "Open MPI" in about else ()), "-n", str(ranks))
+
+
 def measure(
     module: str, arguments: Sequence[str], ranks: int = 1, environment: Mapping[str, str] | None = None
 ) -> Usage:
@@ -87,7 +104,7 @@ def measure(
     environment
         Additional environment variables.
     """
-    launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)] if ranks > 1 else []
+    launcher = mpirun(ranks) if ranks > 1 else []
     with TemporaryDirectory() as scratch:
         command = [*launcher, sys.executable, "-m", "magshell_fenicsx.platform.processes", scratch, module, *arguments]
         output, errors = Path(scratch) / "output", Path(scratch) / "errors"

@@ -33,6 +33,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.motion import UNHELD
+from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
@@ -149,6 +150,7 @@ class Scene:
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
             )
         self.problem, self.comm = problem, comm
+        from_first(comm, check_compiler)
         self.warnings = [said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:

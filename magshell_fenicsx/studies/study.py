@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 from mpi4py import MPI
@@ -14,6 +13,7 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version, fingerprint
+from magshell_fenicsx.platform.processes import mpirun_itself
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.measured import Timings, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
@@ -152,7 +152,7 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
         raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
     if repeat < 1 or not ranks or min(ranks) < 1:
         raise CaseError("--repeat and --ranks must be at least 1")
-    if max(ranks) > 1 and not which("mpirun"):
+    if max(ranks) > 1 and not mpirun_itself():
         raise CaseError("--ranks: there is no mpirun to start more than one")
     if reference is not None and not isfinite(reference):
         raise CaseError(f"--reference {reference}: must be a finite number")

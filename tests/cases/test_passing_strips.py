@@ -1,6 +1,7 @@
 """A step on which shells would pass through each other is shortened: the same on two ranks, and after a resume."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -54,9 +55,10 @@ main()
 def run(folder: Path, *words: str, ranks: int = 1, dies: int = 0) -> int:
     """The exit code of a run that takes long steps for ones that pass through."""
     (folder.parent / "case.json").write_text(json.dumps(CASE), encoding="utf-8")
-    command = [*mpirun(ranks), *(["-x", f"DIES={dies}"] if dies else []), sys.executable, "-c", RUN, "run"]
+    command = [*mpirun(ranks), sys.executable, "-c", RUN, "run"]
     command += [str(folder.parent / "case.json"), "--no-pictures", "--out", str(folder), *words]
-    return subprocess.run(command, capture_output=True, check=False).returncode
+    told = {**os.environ, "DIES": str(dies)} if dies else None
+    return subprocess.run(command, capture_output=True, check=False, env=told).returncode
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """Factors of tangents that change, banded ones against NumPy's eigenvalues, and the condition of a known spectrum."""
 
 import resource
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation import factor
-from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.factor import Factorisation, has_cholmod
 from magshell_fenicsx.continuation.system import Skewed
 
 
@@ -104,7 +106,10 @@ def test_blocks(bs: int) -> None:
             assert factors.negative_pivots == negative
 
 
-def test_another_matrix_or_another_pattern() -> None:
+@pytest.mark.parametrize("definite", [True, False])
+def test_another_matrix_or_another_pattern(monkeypatch: pytest.MonkeyPatch, definite: bool) -> None:
+    """By CHOLMOD, if it is there, and by MUMPS alone."""
+    monkeypatch.setattr(factor, "has_cholmod", lambda: definite and has_cholmod())
     factors = Factorisation(MPI.COMM_SELF)
     factors.factor(matrix([2.0, 4.0, 8.0]))
     K = matrix([1.0, 2.0, 4.0])
@@ -126,6 +131,22 @@ def test_mumps_takes_over_where_cholmod_cannot(monkeypatch: pytest.MonkeyPatch, 
     assert factors.solve(np.ones(2)) == pytest.approx([0.5, 0.25])
 
 
+def test_without_cholmod_its_options_are_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PETSc would call them unused at the end of the program. MUMPS alone factors."""
+    monkeypatch.setattr(factor, "has_cholmod", lambda: False)
+    monkeypatch.setattr(factor, "_new_pc", partial(refused, factor._new_pc))
+    factors = Factorisation(MPI.COMM_SELF)
+    for last in (4.0, 3.0, 2.0, -1.0):
+        factors.factor(matrix([2.0, last]))
+        assert factors.solve(np.ones(2)) == pytest.approx([0.5, 1 / last])
+
+
+def refused(new_pc: Callable[..., PETSc.PC], K: PETSc.Mat, solver: str, *kind: str) -> PETSc.PC:
+    """No factors of CHOLMOD."""
+    assert solver != "cholmod"
+    return new_pc(K, solver, *kind)
+
+
 def test_cholmod_comes_back() -> None:
     """After two matrices that MUMPS finds definite; one that is not in between begins the count again."""
     factors, used = Factorisation(MPI.COMM_SELF), []
@@ -136,9 +157,13 @@ def test_cholmod_comes_back() -> None:
         assert factors.solve(np.ones(2)) == pytest.approx([0.5, 1 / last])
         assert factors.negative_pivots == (last < 0)
         used.append(factors._pc.getFactorSolverType())
+    if not has_cholmod():
+        assert used == ["mumps"] * 9
+        return
     assert used == ["cholmod", *5 * ["mumps"], "cholmod", "cholmod", "mumps"]
 
 
+@pytest.mark.skipif(not has_cholmod(), reason="this PETSc has no CHOLMOD")
 def test_other_errors_of_cholmod_are_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     """55: PETSc is out of memory."""
     with pytest.raises(PETSc.Error) as raised:

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from command import mpirun
 from mpi4py import MPI
 from petsc4py import PETSc
 from toys import matrix, pitchfork, snap_through
@@ -171,7 +172,7 @@ def test_same_on_any_number_of_ranks() -> None:
     """Value and vector, but for its sign, though the start depends on how the rows are shared out."""
     found = []
     for ranks in (1, 2):
-        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, __file__]
+        command = [*mpirun(ranks), sys.executable, __file__]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         found.append(np.loadtxt(done.stdout.splitlines()))

@@ -1,15 +1,32 @@
-"""Libraries that several processes want at the same time, and disks that are full."""
+"""Libraries that several processes want at the same time, disks that are full, compilers of every kind and none."""
 
 import ctypes
+import shutil
 import subprocess
+import sys
+import sysconfig
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from command import started
+from conftest import CASES
+from mpi4py import MPI
 
 from magshell_fenicsx.platform import compiler, kept
+from magshell_fenicsx.platform.compiler import NoCompiler
+from magshell_fenicsx.platform.native import native
 
+LIKE_CLANG = """#!/bin/sh
+for word; do
+    case $word in
+        -fsched*) echo "error: unknown option $word" >&2; exit 1 ;;
+        -dM) echo "#define __GNUC__ 4"; echo "#define __clang__ 1"; exit ;;
+    esac
+done
+exec {} "$@"
+"""  # refuses what is GCC's alone, as Zig's does
 SOURCE = "int seven(void) { return 7; }\n"
 
 
@@ -121,3 +138,74 @@ def test_a_full_disk(tmp_path: Path) -> None:
     reason = r"^kernels cannot be compiled into .*full: No space left on device$"
     with pytest.raises(RuntimeError, match=reason), compiler.written_into(tmp_path / "full"):
         Path("/dev/full").write_text("x", encoding="utf-8")
+
+
+def program(folder: Path, name: str, text: str = "#!/bin/sh\n") -> Path:
+    """A program in a folder."""
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(text, encoding="utf-8")
+    (folder / name).chmod(0o755)
+    return folder / name
+
+
+@pytest.fixture
+def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with all programs that there are: none yet; and no Zig."""
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(compiler, "find_spec", lambda name: None)
+    return tmp_path / "bin"
+
+
+def test_the_compiler_is_any_that_there_is(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of CC, else that of Python, else any of the usual ones, else Zig's; none is refused in words."""
+    with pytest.raises(NoCompiler, match=r"there is no C compiler.*install gcc or clang.*ziglang"):
+        compiler.c_compiler()
+    monkeypatch.setattr(compiler, "find_spec", lambda name: name)
+    assert compiler.c_compiler()[:4] == (sys.executable, "-m", "ziglang", "cc")
+    program(bare, "clang")
+    assert compiler.c_compiler()[0] == "clang"
+    own = sysconfig.get_config_var("CC").split()[0]
+    program(bare, own)
+    assert compiler.c_compiler()[0] == own
+    monkeypatch.setenv("CC", "other -x")
+    with pytest.raises(NoCompiler, match="CC=other -x: there is no such compiler"):
+        compiler.c_compiler()
+    program(bare, "other")
+    assert compiler.c_compiler()[:2] == ("other", "-x")
+
+
+def test_a_compiler_that_is_not_gcc(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package's C code and its libraries are compiled without the options of GCC."""
+    gcc = shutil.which("gcc")
+    if not gcc or not compiler.is_gnu((gcc,)):
+        pytest.skip("no GCC here")
+    monkeypatch.setenv("CC", str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc))).replace(" ", "\\ "))
+    (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
+    assert native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)[1].seven() == 7
+    assert ctypes.CDLL(str(compiler.Library("seven", lambda: SOURCE, ("-O0",)).path())).seven() == 7
+
+
+def test_a_compiler_that_compiles_nothing(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its first error is said, before anything is solved. Where kernels have been compiled, none is needed."""
+    lacking = "#!/bin/sh\necho 'in file\nmath.h: fatal error: no such file' >&2\nexit 1\n"
+    monkeypatch.setenv("CC", str(program(tmp_path, "cc", lacking)))
+    (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
+    said = r"cc.* cannot compile: math\.h: fatal error: no such file; install"
+    with pytest.raises(NoCompiler, match=said):
+        compiler.check_compiler()
+    with pytest.raises(NoCompiler, match=said):
+        native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)
+    kept.keep(compiler.CHECKED, b"yes")
+    compiler.check_compiler()
+
+
+def test_a_run_without_a_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One message, exit code 2, and nothing is solved."""
+    monkeypatch.setenv("CC", "none-of-all")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    done = started("run", CASES / "dimple_buckling.yaml", "--out", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("CC=none-of-all: there is no such compiler; install gcc or clang")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out/path.csv").exists()

@@ -49,19 +49,18 @@ def test_a_choice_without_effect_is_an_error() -> None:
     assert re.fullmatch(r"core-type: OPENBLAS_CORETYPE=Nonesuch has no effect: .* computes for \w+\n", done.stderr)
 
 
-@pytest.mark.parametrize("target", ["test", "fast"])
-def test_make_looks_first(target: str) -> None:
+def test_make_looks_first() -> None:
     """Before its tests; without a choice there is nothing to look for."""
-    lines = said("make", "-n", target, "OPENBLAS_CORETYPE=Nehalem").stdout.splitlines()
+    lines = said("make", "-n", "test", "OPENBLAS_CORETYPE=Nehalem").stdout.splitlines()
     (check,) = (i for i, line in enumerate(lines) if line.split()[:3] == [".ci/in-env", ".ci/core-type", "Nehalem"])
     assert "pytest" in lines[check + 1]
-    assert "core-type" not in said("make", "-n", target).stdout
+    assert "core-type" not in said("make", "-n", "test").stdout
 
 
 MAKE = """#!/bin/sh
 echo "$@" "${OPENBLAS_CORETYPE:-}" "ROOT=${ROOT:-}" >> "$CALLS"
 [ -e "$CALLS.folders" ] || ls -A "$TMPDIR" "$HOME" "$XDG_CACHE_HOME" >> "$CALLS.folders"
-[ "$1" != "$FAILS" ] || [ -n "$ROOT" ]
+[ "$1" != "$FAILS" ]
 """
 
 
@@ -73,9 +72,9 @@ IN = """#!/bin/sh
 """
 
 
-@pytest.mark.parametrize("fails", ["", "test", "fast"])
-def test_ci_runs_both(tmp_path: Path, fails: str) -> None:
-    """In a clone, with folders that are empty at first. What fails with another rounding fails the run, and ends it."""
+@pytest.mark.parametrize("fails", ["", "test", "run"])
+def test_ci_runs_all(tmp_path: Path, fails: str) -> None:
+    """In a clone, with folders that are empty at first. What fails ends it."""
     top, home = tmp_path / "top", tmp_path / "home"
     (top / ".ci").mkdir(parents=True)
     home.mkdir()
@@ -95,9 +94,21 @@ def test_ci_runs_both(tmp_path: Path, fails: str) -> None:
     calls = [[word for word in line.split() if not word.startswith("LIMIT=")] for line in lines]
     assert (done.returncode != 0) == bool(fails)
     assert calls[0] == ["test", "ROOT="]
-    solving = [f"tests/{each}" for each in ("continuation", "models/axisymmetric", "simulate", "cases")]
-    again = ["fast", "OPENBLAS_CORETYPE=Nehalem", f"TESTS={solving[0]}", *solving[1:], "ROOT="]
+    if fails == "test":
+        assert len(calls) == 1
+        return
+    assert calls[1] == ["test", "MARK=slow", "ROOT="]
     unstable = ["test", "ROOT=sid", "MARK=telling", "ROOT=sid"]
-    assert calls[1:3] == ([] if fails == "test" else [unstable, again])
-    assert len(calls) == {"": 4, "test": 1, "fast": 3}[fails]
-    assert ("so do the other fast tests" in done.stdout) == (not fails)
+    case = ["run", "CASE=cases/dimple_buckling.yaml", "ROOT=pypi"]
+    assert calls[2] == unstable
+    assert calls[3][:3] == case
+    if fails == "run":
+        assert len(calls) == 4
+        return
+    assert calls[4] == ["test", "ROOT=pypi", "TESTS=tests/continuation", "tests/simulate", "ROOT=pypi"]
+    solving = [f"tests/{each}" for each in ("continuation", "models/axisymmetric", "simulate", "cases")]
+    assert calls[5] == ["test", "OPENBLAS_CORETYPE=Nehalem", f"TESTS={solving[0]}", *solving[1:], "ROOT="]
+    assert calls[6] == ["test", "ROOT=sid", "MARK=not", "slow", "and", "not", "telling", "ROOT=sid"]
+    assert len(calls) == 7
+    assert "so do the other fast tests" in done.stdout
+    assert "PyPI: a case and the tests of continuation and simulate pass" in done.stdout
