@@ -37,7 +37,7 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
     texts = (f'#line 1 "{each.name}"\n{each.read_text(encoding="utf-8")}\n' for each in (source, *behind))
     text = PRELUDE + "".join(texts)
     library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
-    raised_by_all(comm, lambda: library.path())
+    raised_by_all(comm, library.path)
     ffi = cffi.FFI()
     ffi.cdef(declarations)
     return ffi, ffi.dlopen(str(library.path()))

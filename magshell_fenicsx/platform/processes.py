@@ -179,7 +179,7 @@ def from_first(comm: "MPI.Comm", do: Callable[[], T]) -> T:
     return result
 
 
-def raised_by_all(comm: "MPI.Comm", do: Callable[[], None]) -> None:
+def raised_by_all(comm: "MPI.Comm", do: Callable[[], object]) -> None:
     """Call `do` on every rank; collective.
 
     Raises

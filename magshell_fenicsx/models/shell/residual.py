@@ -32,8 +32,8 @@ class _Site(Protocol):
     def energy(self, nodal: Array, name: str) -> float:
         """That of a term on this rank's part."""
 
-    def compile(self) -> None:
-        """Compile the kernels of `add`; collective."""
+    def begin(self, *, energies: bool) -> None:
+        """Begin the kernels of `add`, and those of `energy` if they will be asked for."""
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         """Add the element vectors (cells, functions * 3) of the terms with these factors."""
