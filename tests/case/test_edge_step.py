@@ -7,7 +7,7 @@ import pytest
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 
 PUSH = {"supports": ["right"], "translation": [-0.01, 0, 0]}
 TURN = {"axis": [0, 2, 0], "angle": 90, "point": [1, 0, 0]}
@@ -18,7 +18,7 @@ def case(*moves: Any, boundary: Any = None, **step: Any) -> Case:
     shell = {"geometry": "plate", "length": 2.0, "width": 0.5, "thickness": 0.02, "poisson_ratio": 0.3}
     held = boundary or {"left": "clamped", "right": "clamped", "bottom": "free"}
     data = {"shell": shell, "boundary": held, "loading": {"kind": "edge", "moves": list(moves), **step}}
-    return Case.from_source(Source("test", data))
+    return Case.from_source(data)
 
 
 def test_in_the_model() -> None:
@@ -83,7 +83,7 @@ BODY = {"plate": {"kind": "plane", "at": {"point": [1.0, 0.25, 0.0]}, "direction
 def test_names_that_other_columns_have(name: str, more: dict[str, Any], words: str | None) -> None:
     """Of reactions, points and bodies; what no other column has is a name."""
     given = case(PUSH, name=name)
-    asked = Case.from_source(Source("test", given.model_dump(mode="json", exclude_none=True) | more))
+    asked = Case.from_source(given.model_dump(mode="json", exclude_none=True) | more)
     if words is None:
         assert make_problem(asked).reactions
         return
@@ -98,4 +98,4 @@ def test_names_that_columns_in_units_have() -> None:
     data = {"shell": shell | {"poisson_ratio": 0.3}, "boundary": {"left": "clamped", "right": "clamped"}}
     data |= {"loading": {"kind": "edge", "name": "left_fx_N", "moves": [move], "points": 1}}
     with pytest.raises(CaseError, match=r"left_fx_N: another column of path\.csv of this case has this name"):
-        make_problem(Case.from_source(Source("test", data)))
+        make_problem(Case.from_source(data))

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 
 R, H, E, NU = 25.2e-3, 0.28e-3, 1.8e6, 0.3
 SHELL = {"geometry": "cap", "radius": "25.2 mm", "thickness": "0.28 mm", "youngs_modulus": "1.8 MPa", "polar": 60}
@@ -15,7 +15,7 @@ PATCH = {"kind": "indentation", "at": {"polar": 0}, "until": "target"}
 
 def case(loading: Any, **shell: Any) -> Case:
     data = {"shell": {**SHELL, "poisson_ratio": NU, **shell}, "boundary": {"rim": "clamped"}, "loading": loading}
-    return Case.from_source(Source("test", data))
+    return Case.from_source(data)
 
 
 @pytest.mark.parametrize(

@@ -4,14 +4,12 @@ The published curves are of S4R on one mesh each, three decimals; for the cantil
 (computed, 1e-11) and the exact circle. Distances as of `obstacles.along_curve`.
 """
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks import obstacles
 from benchmarks.obstacles import (
-    CASES,
     OBSTACLES,
     along_curve,
     at_equal_load,
@@ -21,24 +19,15 @@ from benchmarks.obstacles import (
     second_opinion,
 )
 from benchmarks.obstacles_table import Line
-
-from magshell_fenicsx import Case, Result
-from magshell_fenicsx.public import run
+from solved import result_of_whole_path
 
 SLOW = pytest.mark.slow
 TABLES = {obstacle.case: obstacle for obstacle in OBSTACLES}
 
 
-@cache
-def result(file: str, *settings: str) -> Result:
-    found = run(Case.load(CASES / file, settings))
-    assert found.stopped is None
-    return found
-
-
 def distances(file: str, *settings: str) -> dict[str, float]:
     """Of each quantity, along the curve."""
-    obstacle, rows = TABLES[file.removesuffix(".yaml")], result(file, *settings).rows
+    obstacle, rows = TABLES[file.removesuffix(".yaml")], result_of_whole_path(file, *settings).rows
     return {
         column: along_curve(computed(rows, ours), published(obstacle.table, column))
         for column, ours in obstacle.columns.items()
@@ -47,7 +36,7 @@ def distances(file: str, *settings: str) -> dict[str, float]:
 
 def test_cantilever_under_end_shear() -> None:
     """The inextensible elastica to 1e-4 of the largest displacement; the strip stretches by F/(E h b) = 3e-5."""
-    rows = result("cantilever_end_shear.yaml", "loading.points=4").rows
+    rows = result_of_whole_path("cantilever_end_shear.yaml", "loading.points=4").rows
     for column, ours in {"minus_u_tip_elastica_computed": "-A_ux", "w_tip_elastica_computed": "A_uz"}.items():
         error = at_equal_load(computed(rows, ours), published("cantilever_end_shear", column))
         assert error is not None
@@ -57,7 +46,7 @@ def test_cantilever_under_end_shear() -> None:
 @SLOW
 def test_cantilever_rolled_up_by_an_end_moment() -> None:
     """A full circle: u = L (sin(a)/a - 1), w = L (1 - cos(a))/a."""
-    rows = result("cantilever_end_moment.yaml").rows
+    rows = result_of_whole_path("cantilever_end_moment.yaml").rows
     for row in rows:
         alpha = 2 * np.pi * float(row["load_factor"])
         if alpha:
@@ -102,7 +91,7 @@ def test_pinched_cylinder_up_to_a_tenth_of_the_load() -> None:
     assert max(distances(*begun).values()) < 1e-2
     obstacle = TABLES["pinched_cylinder"]
     for column, calculix in second_opinion(obstacle).items():
-        assert along_curve(computed(result(*begun).rows, obstacle.columns[column]), calculix) < 2e-3
+        assert along_curve(computed(result_of_whole_path(*begun).rows, obstacle.columns[column]), calculix) < 2e-3
 
 
 @pytest.mark.slow
@@ -115,7 +104,7 @@ def test_roofs_snap_through_and_back(file: str, folds: list[float]) -> None:
     Those are samples of a path: a fold lies a little beyond.
     """
     assert max(distances(file).values()) < 1e-2
-    found = [point["value"] for point in result(file).limit_points if point["kind"] == "fold"]
+    found = [point["value"] for point in result_of_whole_path(file).limit_points if point["kind"] == "fold"]
     assert found == pytest.approx(folds, abs=5e-3)
 
 

@@ -5,7 +5,6 @@ References: "axisymmetric" is an independent solver of the meridian's equations,
 """
 
 import pathlib
-from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from conftest import CASES
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.interpolate import CubicSpline
+from solved import result
 
 from magshell_fenicsx import Case, Result, Scene
 from magshell_fenicsx.continuation.control import GivenConjugate
@@ -24,11 +24,6 @@ from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
-
-
-@lru_cache(maxsize=2)
-def result(file: str, *settings: str) -> Result:
-    return run(Case.load(CASES / file, settings))
 
 
 def force_at(found: Result, depth: float) -> float:

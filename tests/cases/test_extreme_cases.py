@@ -12,14 +12,10 @@ from extreme.extremes import ASPECTS, TIP, VARIANTS, Variant, condition_estimate
 from extreme.extremes_table import cells, write
 from mpi4py import MPI
 from petsc4py import PETSc
+from solved import result
 
-from magshell_fenicsx import Case, Result
+from magshell_fenicsx import Result
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.public import run
-
-
-def result(file: str, *settings: str) -> Result:
-    return run(Case.load(CASES / file, settings))
 
 
 def first(found: Result) -> float:

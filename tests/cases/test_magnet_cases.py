@@ -1,6 +1,5 @@
 """Strips and magnets: against a rod in the same field by SciPy, and a magnet that is driven past and back."""
 
-from functools import cache
 from pathlib import Path
 
 import magpylib
@@ -9,6 +8,7 @@ import pytest
 import yaml
 from conftest import CASES
 from scipy.integrate import solve_bvp
+from solved import result
 
 from magshell_fenicsx import Case, Result
 from magshell_fenicsx.continuation.factor import Factorisation
@@ -16,11 +16,6 @@ from magshell_fenicsx.public import run
 
 RADIUS, STACK = 16.913636363636364, 0.7976  # of a cap of cases/magnet_stack.yaml (mm), and k_d of the stack by degree 4
 LENGTH, WIDTH, H, E, BR = 30e-3, 5e-3, 0.5e-3, 1e6, 0.1  # of cases/magnet_strip.yaml
-
-
-@cache
-def result(file: str, *settings: str) -> Result:
-    return run(Case.load(CASES / file, settings))
 
 
 def rod(position: tuple[float, float, float]) -> tuple[float, float]:

@@ -1,24 +1,15 @@
 """Cases whose supports move: the shortened strip against a beam, the magnetic arch against its measured ramp."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from benchmarks import arch
 from conftest import CASES
 from scipy.integrate import solve_bvp
+from solved import result_of_whole_path
 
-from magshell_fenicsx import Case, Result
-from magshell_fenicsx.public import run
+from magshell_fenicsx import Case
 
 EULER, EPS = 4 * np.pi**2, 1e-4 / 12  # over EI/L^2; EI/(EA L^2)
-
-
-@cache
-def result(file: str, *settings: str) -> Result:
-    found = run(Case.load(CASES / file, settings))
-    assert found.stopped is None
-    return found
 
 
 def elastica(shortening: float) -> tuple[float, float, float]:
@@ -45,7 +36,7 @@ def elastica(shortening: float) -> tuple[float, float, float]:
 @pytest.mark.slow
 def test_shortened_strip() -> None:
     """Euler's load at the located bifurcation; the beam at 0.5 and 1 % on both branches; reactions in equilibrium."""
-    rows = result("shortened_strip.yaml").rows
+    rows = result_of_whole_path("shortened_strip.yaml").rows
     onset = next(row for row in rows if row["label"] == "bifurcation")
     assert onset["mode"] == "symmetric"
     assert float(onset["reaction"]) == pytest.approx(EULER, rel=1e-3)
@@ -72,7 +63,7 @@ def test_arch() -> None:
     Stable until the fold, and antisymmetric modes become unstable right behind it. Half the element size moves it by
     4e-4. The distance to the measured snap is that of a quasi-static path to a ramp of 6.5 mT/s.
     """
-    found = result("arch.yaml")
+    found = result_of_whole_path("arch.yaml")
     case, rows = Case.load(CASES / "arch.yaml"), found.rows
     curve, points, fold = arch.ramp(rows, case), arch.measured(), arch.first_fold(rows)
     assert rows[fold]["mode"] == ""

@@ -136,7 +136,7 @@ MATERIAL = {"thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0.3}
 
 
 def deflection(data: dict[str, Any]) -> float:
-    result = run(Case.from_source(Source("test", data)))
+    result = run(Case.from_source(data))
     assert result.stopped is None
     return float(result.rows[-1]["A_ux"])
 
@@ -168,7 +168,7 @@ def test_remanence_and_thickness_of_patches(model: Any, tmp_path: Path) -> None:
     found = []
     for remanent in (by_name, by_place):
         magnetic = {"lambda_m": 2e-4, "remanent": remanent, "applied": {"polar": 45}}
-        found.append(Scene(Case.from_source(Source("test", {**LOADED, "shell": shell, "magnetic": magnetic}))))
+        found.append(Scene(Case.from_source({**LOADED, "shell": shell, "magnetic": magnetic})))
     u = 0.01 * np.sin(5 * found[0].model.r0.x.array[: found[0].model.system.size])
     energies = [scene.model.system.energies(u)["magnetic"] for scene in found]
     # where the formula jumps between two cells, each has its own value
@@ -305,7 +305,7 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
         ({"boundary": {"top": {"held": ["z"]}}}, "the shell is not held"),
     ):
         with pytest.raises(MeshError, match=said):
-            Scene(Case.from_source(Source("test", {"shell": shell, "mesh": {"degree": 2}, **changed})), MPI.COMM_SELF)
+            Scene(Case.from_source({"shell": shell, "mesh": {"degree": 2}, **changed}), MPI.COMM_SELF)
 
 
 def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2}}
     data["symmetry"] = "none"  # its two triangles are each other's mirror images
-    scene = Scene(Case.from_source(Source("test", data)), MPI.COMM_SELF)
+    scene = Scene(Case.from_source(data), MPI.COMM_SELF)
     assert not scene.model.midsurface.patches
     assert isinstance(scene.model.loads.magnetic.remanent, ByPatch)  # type: ignore[union-attr]
     assert scene.model.loads.magnetic.remanent.vectors == pytest.approx(np.tile([0, 0, 1], (2, 1)))  # type: ignore[union-attr]
@@ -344,7 +344,7 @@ def test_unknown_patches_are_refused_when_checked(model: Any, tmp_path: Path) ->
     ):
         data = {"shell": shell, "boundary": {"rim": "clamped"}, **changed}
         with pytest.raises(CaseError, match=r"no (such )?patch"):
-            describe(Case.from_source(Source("test", data)))
+            describe(Case.from_source(data))
 
 
 CASE_FILE = """

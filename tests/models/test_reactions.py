@@ -10,7 +10,6 @@ from models.moving_scenes import CLAMPED, NONE, PLATE, RING, move, moving_scene
 import magshell_fenicsx as ms
 from magshell_fenicsx import Scene
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Move
 from magshell_fenicsx.parts.supports.reactions import Reaction, reactions
 
@@ -142,7 +141,7 @@ def hinged_plate(names: Sequence[str], **sections: Any) -> dict[str, Reaction]:
         "symmetry": "none",
     }
     boundary = case["boundary"] | sections.pop("boundary", {})  # type: ignore[operator]
-    scene = Scene(ms.Case.from_source(Source("test", case | {"boundary": boundary} | sections)))
+    scene = Scene(ms.Case.from_source(case | {"boundary": boundary} | sections))
     *_, last = ms.follow(scene)
     return found(scene, last.point.state)
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import document_of
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.colours import couple
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "loading": {"kind": "pressure", "until": "limit"},
     }
     out = tmp_path_factory.mktemp("played")
-    ms.run(ms.Case.from_source(Source("test", sections)), out, pictures=False)
+    ms.run(ms.Case.from_source(sections), out, pictures=False)
     write_report(out)
     return out
 
@@ -181,7 +181,7 @@ def test_pictures_are_no_part_of_what_is_resumed(tmp_path: Path) -> None:
     shell = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0}
     plain: dict[str, Any] = {"shell": shell, "boundary": {"root": "clamped"}}
     first, other, finer = (
-        document_of(ms.Case.from_source(Source("test", plain | more)))
+        document_of(ms.Case.from_source(plain | more))
         for more in ({}, {"output": {"dpi": 90}}, {"mesh": {"degree": 3}})
     )
     refuse_other(identity(first), other, tmp_path)

@@ -140,7 +140,7 @@ def test_thickness_that_varies() -> None:
         shell = {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3, **factor}
         magnetic = {"lambda_m": 1e-3, "remanent": {"polar": 90}, "applied": {"polar": 90}}
         data = {"shell": shell, "boundary": {"bottom": "clamped"}, "magnetic": magnetic, "symmetry": "none"}
-        scene = Scene(Case.from_source(Source("test", {**data, "mesh": {"degree": 2, "size": 0.5}})))
+        scene = Scene(Case.from_source({**data, "mesh": {"degree": 2, "size": 0.5}}))
         surface = SurfaceGatherer(scene.model).gather(scene.model.zero())  # type: ignore[arg-type]
         assert surface
         assert ("f_mag" in surface.fields) == (not factor)

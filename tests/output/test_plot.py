@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.picture import PICTURES
@@ -35,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "loading": {"kind": "pressure", "until": "limit"},
     }
     out = tmp_path_factory.mktemp("run")
-    ms.run(ms.Case.from_source(Source("test", sections)), out)
+    ms.run(ms.Case.from_source(sections), out)
     return out
 
 
@@ -70,7 +70,7 @@ def test_whole_shells_of_a_half(tmp_path: Path) -> None:
         "mesh": {"degree": 2, "refinement": 0.3},
         "output": {"whole": True},
     }
-    ms.run(ms.Case.from_source(Source("test", sections)), tmp_path)
+    ms.run(ms.Case.from_source(sections), tmp_path)
     half, whole = (pyvista.get_reader(tmp_path / f"fields/{name}.pvd") for name in ("path", "whole"))
     assert half.time_values == whole.time_values == [0.0, 1e-4]
     for reader, share in ((half, 0.5), (whole, 1.0)):
@@ -112,7 +112,7 @@ def test_a_turning_field(tmp_path: Path) -> None:
         "loading": {"kind": "rotation", "to": {"polar": 0}, "points": 1},
         "mesh": {"degree": 2, "refinement": 0.5},
     }
-    ms.run(ms.Case.from_source(Source("test", sections)), tmp_path)
+    ms.run(ms.Case.from_source(sections), tmp_path)
     last = read_rows(tmp_path / "path.csv")[-1]
     assert last["field_angle"] == pytest.approx(90)
     assert isinstance(last["energy"], float)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.pictures.picture import figures
@@ -52,7 +51,7 @@ def test_a_remanence_without_a_field_is_drawn() -> None:
             "loading": {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.01},
             "mesh": {"degree": 2, "refinement": 0.5},
         }
-        scene = ms.Scene(ms.Case.from_source(Source("test", sections)))
+        scene = ms.Scene(ms.Case.from_source(sections))
         found = gatherer(scene.model, scene.comm).gather(scene.unloaded().u, {})
         assert found
         assert [name for name in found.fields if name in ("Br", "Ba", "p_mag", "k", "tau")] == shown

@@ -8,7 +8,6 @@ from conftest import CASES, disc
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.point_fields import PointFields
@@ -23,7 +22,7 @@ NU = 0.3
 
 
 def scene_of(file: str = "", *settings: str, **sections: Any) -> Scene:
-    return Scene(Case.load(CASES / file, list(settings)) if file else Case.from_source(Source("test", sections)))
+    return Scene(Case.load(CASES / file, list(settings)) if file else Case.from_source(sections))
 
 
 def unmoved(scene: Scene, **mu: float) -> Any:

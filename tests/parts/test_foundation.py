@@ -11,7 +11,6 @@ from scipy.special import airy
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.quantities.registry import quantity
@@ -22,7 +21,7 @@ PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure":
 
 
 def load(**sections: Any) -> ms.Case:
-    return ms.Case.from_source(Source("test", sections))
+    return ms.Case.from_source(sections)
 
 
 def end(case: ms.Case) -> dict[str, float]:

@@ -11,13 +11,13 @@ import magshell_fenicsx as ms
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1.0, "thickness": 0.01, "poisson_ratio": 0.3}
 
 
 def made(**sections: Any) -> Case:
-    return Case.from_source(Source("test", sections))
+    return Case.from_source(sections)
 
 
 def ended(case: Case) -> dict[str, float]:

@@ -7,14 +7,14 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.opened import changed
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.simulate.numbers import number_of
 
 
 def case(**sections: Any) -> ms.Case:
-    return ms.Case.from_source(Source("test", sections))
+    return ms.Case.from_source(sections)
 
 
 def plies(*angles: float) -> list[dict[str, float]]:

@@ -11,13 +11,13 @@ from magshell_fenicsx import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 
 SMALL = 1e-3  # ρ ω² R²/E: strains of the same order
 
 
 def made(**sections: Any) -> Case:
-    return Case.from_source(Source("test", sections))
+    return Case.from_source(sections)
 
 
 def disc(model: str = "shell", symmetry: str = "auto", **further: Any) -> Case:

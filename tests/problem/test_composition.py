@@ -8,7 +8,7 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 
 H, NU = 0.02, 0.3
@@ -28,7 +28,7 @@ COARSE = {"degree": 3, "refinement": 0.4}
 def case(shape: str, shell: dict[str, Any] | None = None, **sections: Any) -> ms.Case:
     given, edge = SHAPES[shape]
     data = {"shell": {**given, "poisson_ratio": NU, **(shell or {})}, "boundary": {edge: "clamped"}, "mesh": COARSE}
-    return ms.Case.from_source(Source("test", data | sections))
+    return ms.Case.from_source(data | sections)
 
 
 def end(asked: ms.Case) -> dict[str, float]:
@@ -184,9 +184,7 @@ def test_half_of_a_ring_with_an_oblique_edge_load() -> None:
     loading = {"kind": "dead", "loads": [{"edge": "inner", "per_length": [1e-7, 1e-6, 1e-6]}], "factor": 1, "points": 1}
     data = {"boundary": {"outer": "clamped"}, "mesh": {"degree": 3, "size": 0.3}, "loading": loading}
     shell = {"poisson_ratio": NU, **ANNULUS}
-    half, whole = (
-        end(ms.Case.from_source(Source("test", {"shell": shell, "symmetry": s, **data}))) for s in ("half", "none")
-    )
+    half, whole = (end(ms.Case.from_source({"shell": shell, "symmetry": s, **data})) for s in ("half", "none"))
     for column in ("w_over_h", "energy"):
         assert half[column] == pytest.approx(whole[column], rel=1e-4)
 

@@ -11,7 +11,7 @@ from test_composition import NU, H, end
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.shells.modes import ShellModes
 
 MATERIAL = {"thickness": H, "poisson_ratio": NU, "youngs_modulus": 1.0}
@@ -65,7 +65,7 @@ HALVES: dict[str, tuple[list[float], dict[str, Any]]] = {
 def case(symmetry: str, **sections: Any) -> ms.Case:
     data = {"loading": DEAD, "mesh": {"degree": 3, "size": 0.26}, "symmetry": symmetry, **sections}
     data["shell"] = MATERIAL | data["shell"]
-    return ms.Case.from_source(Source("test", data))
+    return ms.Case.from_source(data)
 
 
 @pytest.mark.parametrize("name", HALVES)
@@ -193,13 +193,13 @@ def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> No
     shell = {"geometry": "hemisphere", "radius_to_thickness": 1 / H, "poisson_ratio": NU, **defect}
     mesh = {"degree": 3, "refinement": 0.5}
     data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": loading, "mesh": mesh, "symmetry": "half"}
-    built_in = ms.Case.from_source(Source("test", data))
+    built_in = ms.Case.from_source(data)
     file = mesh_of(built_in, tmp_path / "hemisphere.msh")
     shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, "thickness": H, "poisson_ratio": NU}
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3}, "loading": loading}
     if column == "force":
         data |= {"points": {"A": [0, 0, 1]}, "loading": loading | {"at": {"point": "A"}}}
-    half, whole = (ms.Case.from_source(Source("test", data | {"symmetry": s})) for s in ("auto", "none"))
+    half, whole = (ms.Case.from_source(data | {"symmetry": s}) for s in ("auto", "none"))
     assert (make_problem(half).half, make_problem(whole).half) == (True, False)
     found = result(half, column)
     assert found == pytest.approx(result(built_in, column), rel=2e-4)
@@ -213,7 +213,7 @@ SOLID = pytest.param({"model": "solid"}, marks=pytest.mark.slow)
 def test_a_mesh_file_with_a_curve_in_its_plane(model: dict[str, Any], tmp_path: Path) -> None:
     """Other triangles on either side: one of them is half of the surface, if that is asked for."""
     grid = {"shell": MATERIAL | PLATE, "boundary": {}, "mesh": {"size": 0.25}, "symmetry": "none"}
-    patch = make_problem(ms.Case.from_source(Source("test", grid))).triangulated()
+    patch = make_problem(ms.Case.from_source(grid)).triangulated()
     nodes = patch.embedding(patch.nodes)
     move = (nodes[:, 0] > 0.51) & (nodes[:, 0] < 0.99) & (nodes[:, 1] > 0.01) & (nodes[:, 1] < 0.49)
     nodes[move] += [0.03, 0.02, 0.0]

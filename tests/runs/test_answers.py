@@ -9,7 +9,6 @@ import pytest
 from command import magshell, read_path
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
@@ -19,7 +18,7 @@ MESH = {"degree": 3, "refinement": 0.7}
 
 
 def case_of(shell: dict[str, Any], edge: dict[str, str], **sections: Any) -> Case:
-    return Case.from_source(Source("test", {"shell": shell, "boundary": edge, "mesh": MESH} | sections))
+    return Case.from_source({"shell": shell, "boundary": edge, "mesh": MESH} | sections)
 
 
 def dimpled(radius: float, amplitude: float, **load: Any) -> Case:
@@ -74,20 +73,20 @@ def test_path_that_is_lost_beyond_the_first_instability(tmp_path: Path, monkeypa
     assert pictures[0] == pictures[1]
     report = (tmp_path / "limit" / "report.html").read_text(encoding="utf-8")
     assert f"Bending moments at point {number}, the first instability." in report
-    known = run(Case.from_source(Source("test", PERFECT | {"loading": {"kind": "pressure", "until": "bifurcation"}})))
+    known = run(Case.from_source(PERFECT | {"loading": {"kind": "pressure", "until": "bifurcation"}}))
     assert summary["knockdown"] == pytest.approx(known.knockdown, rel=1e-9)
 
 
 def test_python_hears_what_is_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 9)
     with pytest.warns(UserWarning, match=BEYOND):
-        labels = [record.label for record in follow(Scene(Case.from_source(Source("test", PERFECT))))]
+        labels = [record.label for record in follow(Scene(Case.from_source(PERFECT)))]
     assert "bifurcation" in labels
 
 
 def test_path_that_is_lost_before_an_instability_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 3)
-    found = run(Case.from_source(Source("test", PERFECT)))
+    found = run(Case.from_source(PERFECT))
     assert found.stopped
     assert (found.remarks, found.knockdown) == ([], None)
 
@@ -98,7 +97,7 @@ def test_snap_of_a_shell_that_has_buckled_before() -> None:
     load = {"kind": "pressure", "until": "limit", "then": "snap"}
     data = in_units(25, "0.6 mm", mesh=MESH, loading=load) | {"boundary": {"rim": "hinged"}}
     heard, records = list[str](), list[Any]()
-    for record in follow(Scene(Case.from_source(Source("test", data))), remark=heard.append):
+    for record in follow(Scene(Case.from_source(data)), remark=heard.append):
         records.append(record)
         if record.amplitude == "time":
             break
@@ -115,7 +114,7 @@ def test_plate_on_a_deep_cap_snaps() -> None:
     """Where it snaps a finer mesh (refinement 2) has 5.40719 h; behind it the contact goes back the way it came."""
     loading = {"kind": "contact", "approach": "8 mm", "points": 10}
     data = in_units(40, "0.5 mm", bodies={"plate": {"kind": "plane"}}, loading=loading)
-    found = run(Case.from_source(Source("test", data)))
+    found = run(Case.from_source(data))
     (fold,) = (row for row in found.rows if row["label"] == "fold")
     assert fold["approach_over_h"] == pytest.approx(5.40719, rel=1e-3)
     assert found.stopped
@@ -129,9 +128,7 @@ def test_line_of_a_fold_has_the_force_of_its_body() -> None:
     bodies = {"plate": {"kind": "plane"}, "ball": ball | {"direction": [0, 0, 1]}}
     loading = {"kind": "contact", "body": "plate", "until": "limit"}
     lines = list[str]()
-    found = run(
-        Case.from_source(Source("test", in_units(22, "0.5 mm", bodies=bodies, loading=loading))), say=lines.append
-    )
+    found = run(Case.from_source(in_units(22, "0.5 mm", bodies=bodies, loading=loading)), say=lines.append)
     fold = next(line for line in lines if " fold " in line)
     assert found.rows[-1]["force_plate_N"] == pytest.approx(0.0696, rel=1e-3)
     assert f"F {found.rows[-1]['force_plate_N']:9.5g} N" in fold
@@ -151,7 +148,7 @@ def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     known = summary["tolerance"]
     assert known["error_estimate"] == min(each["estimate"] for each in known["rounds"])
-    exact = run(Case.from_source(Source("test", data | {"mesh": {"degree": 5, "refinement": 2.0}}))).knockdown
+    exact = run(Case.from_source(data | {"mesh": {"degree": 5, "refinement": 2.0}})).knockdown
     assert summary["knockdown"] == pytest.approx(exact, rel=max(known["error_estimate"], 1e-8))
     told = re.search(r" The estimated relative error of the result is (\S+)\.$", done.stdout.rstrip())
     assert told

@@ -16,14 +16,14 @@ from scipy.optimize import brentq
 from scipy.special import ive, jv
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 
 
 def scene_of(shell: dict[str, Any], boundary: dict[str, Any], **sections: Any) -> Scene:
-    return Scene(Case.from_source(Source("test", {"shell": shell, "boundary": boundary, **sections})))
+    return Scene(Case.from_source({"shell": shell, "boundary": boundary, **sections}))
 
 
 def lowest(scene: Scene, count: int) -> list[tuple[str, float]]:

@@ -6,7 +6,6 @@ import pytest
 from ufl.core.expr import Expr
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.kinematics import Jet
 
 TENSION, NU = 0.02, 0.3
@@ -23,7 +22,7 @@ def test_a_plate_shrinks_under_its_surface_tension() -> None:
     held = {"left": "symmetry", "bottom": "symmetry", "right": {"held": ["z"]}, "top": {"held": ["z"]}}
     pressed = {"kind": "pressure", "pressure": 1e-6, "until": "target", "points": 1}
     sections = {"shell": shell, "boundary": held, "points": {"corner": [1, 1, 0]}, "loading": pressed}
-    case = ms.Case.from_source(Source("test", {**sections, "mesh": {"size": 0.5}}))
+    case = ms.Case.from_source({**sections, "mesh": {"size": 0.5}})
     scene = ms.Scene(case.with_terms([ms.OwnTerm("tension", tension, value=TENSION)]))
     first, *rise, last = ms.follow(scene)
     assert first.point.state.mu["tension"] == 0
@@ -38,6 +37,6 @@ def test_weight_that_a_cap_does_not_carry() -> None:
     """Four times p_c, which no cap carries: p_c R/(E h) = 2/√(3(1 - ν²)) h/R."""
     shell = {"geometry": "cap", "polar": 40, "radius": 1.0, "thickness": 0.01, "poisson_ratio": NU}
     weight = ms.OwnTerm("weight", lambda r0, u: u.r[2], value=0.05)
-    case = ms.Case.from_source(Source("test", {"shell": shell, "boundary": {"rim": "hinged"}})).with_terms([weight])
+    case = ms.Case.from_source({"shell": shell, "boundary": {"rim": "hinged"}}).with_terms([weight])
     with pytest.raises(ms.Stopped, match="on the way to rest under the energy weight: "):
         list(ms.follow(ms.Scene(case)))

@@ -7,7 +7,6 @@ import pytest
 from benchmarks.contacts_in_time import CASES, SMALL, apart, imbalance, moved
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.gap import mean_pressure, penalty
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import imbalances, rows
@@ -24,7 +23,7 @@ THROWN = {"kind": "time", "points": 10, "velocity": ["0", "0", "0.01*(1-x**2-y**
 
 
 def found_of(base: dict[str, Any], *steps: dict[str, Any], **sections: Any) -> tuple[Case, list[dict[str, Any]]]:
-    case = Case.from_source(Source("test", {**base, **sections, "loading": list(steps)}))
+    case = Case.from_source({**base, **sections, "loading": list(steps)})
     scene = Scene(case)
     return case, rows(scene, follow(scene))
 

@@ -14,7 +14,6 @@ from many import sweep
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.folds import Continuation
@@ -146,7 +145,7 @@ def test_shallow_caps_are_similar() -> None:
         shell = {"geometry": "cap", "radius": R, "thickness": 1, "polar": 35, "poisson_ratio": 0.5, "defect": dimple}
         mesh = {"degree": 4, "refinement": 0.4}
         data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": mesh, "loading": {"kind": "pressure"}}
-        result = run(Case.from_source(Source("test", data)))
+        result = run(Case.from_source(data))
         return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
 
     (source, fold), (target, there) = at(90), at(100)

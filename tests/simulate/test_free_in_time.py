@@ -11,7 +11,6 @@ from scipy.special import ellipe, ellipk
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.runs.rows import columns
 from magshell_fenicsx.simulate.follow import follow
@@ -48,7 +47,7 @@ SWING = {
 
 
 def case_of(**sections: Any) -> Case:
-    return Case.from_source(Source("test", {**MAGNET, **sections}))
+    return Case.from_source({**MAGNET, **sections})
 
 
 def test_a_magnetised_plate_is_a_compass_needle() -> None:
@@ -91,7 +90,7 @@ def test_two_free_magnets_attract() -> None:
         "loading": {**fall, "history": {"interaction": [[0, 1], [1, 1]]}},
         "mesh": {"refinement": 0.6},
     }
-    scene = Scene(Case.from_source(Source("test", case)))
+    scene = Scene(Case.from_source(case))
     *_, end = columns(scene, follow(scene))["w_over_h"]
 
     current = remanence / MU0 * thickness

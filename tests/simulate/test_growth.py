@@ -15,7 +15,7 @@ from interrupted import check_same_path
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.45, "points": 1}
@@ -31,7 +31,7 @@ def case(*loading: dict[str, Any], imperfections: Any = (DIMPLE,), **others: Any
         "loading": list(loading),
         "mesh": {"refinement": 0.4},
     }
-    return ms.Case.from_source(Source("test", data | others))
+    return ms.Case.from_source(data | others)
 
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])

@@ -10,7 +10,7 @@ from command import magshell
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.motion.step import level_in
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.rows import columns, rows
@@ -32,7 +32,7 @@ BEAM = 3.5160 * np.sqrt(1 / 12) / 50  # omega of a cantilever, R/h = 50, nu = 0
 
 
 def case_of(base: dict[str, Any], *steps: dict[str, Any], **sections: Any) -> Case:
-    return Case.from_source(Source("test", {**base, **sections, "loading": list(steps)}))
+    return Case.from_source({**base, **sections, "loading": list(steps)})
 
 
 def columns_of(case: Case) -> dict[str, Any]:

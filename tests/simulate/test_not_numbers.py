@@ -7,7 +7,6 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, Jet, OwnTerm
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import run
 
 CAP = {
@@ -43,7 +42,7 @@ def ended(r0: Jet, u: Jet) -> Expr:
 @pytest.mark.parametrize("energy", [on_a_part, steep])
 def test_at_the_begin(energy: object, tmp_path: Path) -> None:
     """No step could be small enough: it never ended."""
-    case = Case.from_source(Source("test", {**CAP, "loading": [LOADED]}))
+    case = Case.from_source({**CAP, "loading": [LOADED]})
     found = run(case, tmp_path / "out", terms=[OwnTerm("own", energy, value=1.0)], pictures=False)  # type: ignore[arg-type]
     assert found.stopped == "own is not a number at its begin, in value or derivative"
     assert len(found.rows) == 1
@@ -53,7 +52,7 @@ def test_at_the_begin(energy: object, tmp_path: Path) -> None:
 @pytest.mark.parametrize("step", [pytest.param(LOADED, marks=pytest.mark.slow), MOVING])
 def test_on_the_way(step: dict[str, object], tmp_path: Path) -> None:
     """Steps become small, then the run stops; its points are there."""
-    case = Case.from_source(Source("test", {**CAP, "loading": [step]}))
+    case = Case.from_source({**CAP, "loading": [step]})
     found = run(case, tmp_path / "out", terms=[OwnTerm("own", ended, value=1.0)], pictures=False)
     assert found.stopped
     assert found.stopped.endswith("; where it was tried last, own was not a number")

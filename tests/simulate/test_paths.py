@@ -3,21 +3,14 @@
 "axisymmetric": an independent solver of the meridian's equations, nine digits.
 """
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import CASES
 from scipy.special import ellipk
+from solved import result
 
-from magshell_fenicsx import Case, Result
-from magshell_fenicsx.public import run
-
-
-@lru_cache(maxsize=2)
-def result(file: str, *settings: str) -> Result:
-    return run(Case.load(CASES / file, settings))
+from magshell_fenicsx import Result
 
 
 def events(found: Result) -> list[tuple[str, str, Any]]:

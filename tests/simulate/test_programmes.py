@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from magshell_fenicsx import Record, columns, run
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.steps import stage_of
@@ -35,7 +35,7 @@ def case(*loading: dict[str, Any], **others: Any) -> Case:
         "loading": list(loading),
         **COARSE,
     }
-    return Case.from_source(Source("test", data | others))
+    return Case.from_source(data | others)
 
 
 def history(asked: Case) -> tuple[Scene, list[Record]]:

@@ -14,7 +14,6 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.continuation.transient import Integrator
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.runs.rows import departures
 from magshell_fenicsx.runs.rows import rows as table_of
 from magshell_fenicsx.shells.mass import mass
@@ -34,7 +33,7 @@ Array = NDArray[np.float64]
 def rows_of(step: dict[str, Any]) -> tuple[Scene, Record, list[Record]]:
     """With the last record before those in time."""
     sections = {"shell": SHELL, "boundary": {"rim": "clamped"}, "symmetry": "axisymmetric", "mesh": MESH}
-    scene = Scene(Case.from_source(Source("test", sections | {"loading": [step]})))
+    scene = Scene(Case.from_source(sections | {"loading": [step]}))
     records = list(follow(scene))
     moving = [record for record in records if record.clock and record.point.dmu]  # not the equilibrium at rest
     return scene, records[records.index(moving[0]) - 1], moving

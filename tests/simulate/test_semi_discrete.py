@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.transient import Integrator
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.shells.mass import mass
 
 DRAG, END = 0.02, 6.0
@@ -19,7 +18,7 @@ DRAG, END = 0.02, 6.0
 def scene_of(symmetry: str, **mesh: float) -> Scene:
     shell = {"geometry": "cap", "polar": 30, "radius": 1.0, "thickness": 0.03, "poisson_ratio": 0.3}
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "symmetry": symmetry, "mesh": mesh}
-    return Scene(Case.from_source(Source("test", data | {"loading": {"kind": "pressure"}})))
+    return Scene(Case.from_source(data | {"loading": {"kind": "pressure"}}))
 
 
 def pressure(t: float, before: bool = True) -> dict[str, float]:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.coupled import times
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.follow import follow
@@ -40,7 +39,7 @@ def discs(**shell: Any) -> dict[str, Any]:
 
 
 def found_of(base: dict[str, Any]) -> list[dict[str, Any]]:
-    scene = Scene(Case.from_source(Source("test", base)))
+    scene = Scene(Case.from_source(base))
     return rows(scene, follow(scene))
 
 
@@ -55,7 +54,7 @@ def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
     """Where contact sets in, ceases and goes on: 1e-9 of the larger energy. Differences of the force are its tangent
     within 1e-3, as the tangent leaves out how factors at kinks change with the direction of the way."""
     steps = {"loading": [{"kind": "time", "duration": 1.0, "points": 1}], "symmetry": symmetry}
-    scene = Scene(Case.from_source(Source("test", discs(**shell) | steps | {"mesh": MESHES[symmetry]})))
+    scene = Scene(Case.from_source(discs(**shell) | steps | {"mesh": MESHES[symmetry]}))
     (contact,), h = scene.model.touchings, scene.model.material.h
     r = contact._r0
 
@@ -133,7 +132,7 @@ def test_a_plane_with_a_position_beside_several_shells() -> None:
 @pytest.mark.parametrize(("symmetry", "mesh"), [("axisymmetric", MESHES["axisymmetric"]), ("half", {"degree": 2})])
 def test_the_start_row_has_the_energy_of_the_initial_velocity(symmetry: str, mesh: dict[str, float]) -> None:
     """m v^2/2 of two discs that move as (1 - r^2)^2, whose square has the mean 1/5; over E h R^2."""
-    case = Case.from_source(Source("test", DISCS | {"loading": [THROWN], "symmetry": symmetry, "mesh": mesh}))
+    case = Case.from_source(DISCS | {"loading": [THROWN], "symmetry": symmetry, "mesh": mesh})
     v = 0.05 / np.sqrt(1e6 / 1000)  # over the speed of waves
     assert next(follow(Scene(case))).clock["kinetic"] == pytest.approx(2 * np.pi * v**2 / 2 / 5, rel=1e-3)
 
@@ -149,7 +148,7 @@ def test_equal_plates_that_meet_flat_exchange_their_velocities(speed: float, har
     thrown = {"kind": "time", "velocity": ["0", "0", f"-{speed}*z/0.0015"], "rho_inf": 1.0, "points": 2}
     thrown["duration"] = 1e-3 / speed  # twice the time to the impact
     base = DISCS | {"shells": shells, "foundation": {"stiffness": 1.0}, "symmetry": "none", "mesh": MESHES["half"]}
-    scene = Scene(Case.from_source(Source("test", base | {"loading": [thrown]})))
+    scene = Scene(Case.from_source(base | {"loading": [thrown]}))
     start, *_, end = follow(scene)
     high = scene.model.r0.x.array.reshape(-1, 3)[:, 2] > 0.01
     v = end.point.du.reshape(-1, 3)[:, 2] * np.sqrt(1e6 / 1000)

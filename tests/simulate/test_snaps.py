@@ -8,7 +8,7 @@ import pytest
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.point import Finding, Point
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.report.verdict import _snaps
 from magshell_fenicsx.runs.rows import columns, rows
 from magshell_fenicsx.runs.running import Interrupted
@@ -22,7 +22,7 @@ def case_of(radius: float, amplitude: float, **load: Any) -> Case:
     shell = {"geometry": "hemisphere", "radius_to_thickness": radius, "poisson_ratio": 0.5, "imperfections": [dimple]}
     pressed = {"kind": "pressure", "until": "limit"} | load
     data = {"shell": shell, "boundary": {"equator": "clamped"}, "symmetry": "axisymmetric", "mesh": {"refinement": 0.4}}
-    return Case.from_source(Source("test", data | {"loading": pressed}))
+    return Case.from_source(data | {"loading": pressed})
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_a_resumed_snap_is_the_same() -> None:
     shell = {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3, "defect": defect}
     snap = {"kind": "pressure", "until": "limit", "then": "snap", "snap": {"tolerance": 0.1}}
     data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": snap}
-    case = Case.from_source(Source("test", data | {"mesh": {"refinement": 0.5, "degree": 3}}))
+    case = Case.from_source(data | {"mesh": {"refinement": 0.5, "degree": 3}})
     whole = Kept()
     wanted = numbers(whole)
     stopped = Kept(steps=1200)  # of which some 1100 are of rehearsals

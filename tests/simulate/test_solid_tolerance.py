@@ -6,7 +6,6 @@ import pytest
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import by_path
@@ -17,7 +16,7 @@ def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
     shell = {"geometry": "disc", "radius_to_thickness": 10, "poisson_ratio": 0.3}
     loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.01, "points": 1}
     data = {"model": "solid", "shell": shell, "boundary": {"rim": "clamped"}, "loading": loading, "mesh": mesh}
-    return Case.from_source(Source("test", {**data, "solid": {"layers": layers}}))
+    return Case.from_source({**data, "solid": {"layers": layers}})
 
 
 @pytest.mark.slow

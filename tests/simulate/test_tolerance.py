@@ -102,7 +102,7 @@ def test_ends_of_several_shells_are_carried() -> None:
     """Each gives its own to itself, though they cross in space: exact to a higher degree, and the fold of its path."""
     flaw = {"kind": "gaussian", "amplitude": 0.5, "width": 1.5, "at": {"polar": 10}}
     shells = {"lower": dome(0.03, 0.0, imperfections=[flaw]), "upper": dome(0.04, 0.01)}
-    case = Case.from_source(Source("test", {"shells": shells, "loading": {"kind": "pressure", "until": "limit"}}))
+    case = Case.from_source({"shells": shells, "loading": {"kind": "pressure", "until": "limit"}})
     low, high, finer = (Choice(*each).scene(case.problem(), COMM) for each in ((3, 0.4), (4, 0.4), (4, 0.6)))
     end = by_path(low)
     assert carry(high, low, carry(low, high, end.state.u)) == pytest.approx(end.state.u, abs=1e-9)
@@ -205,8 +205,8 @@ def test_a_tolerance_on_a_grid() -> None:
         "points": {"A": [1, 0, 0.5]},
         "loading": {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1},
     }
-    fine = Case.from_source(Source("test", {**data, "mesh": {"degree": 5, "refinement": 1.6}}))
-    mesh = adapted(Case.from_source(Source("test", {**data, "mesh": {"tolerance": 1e-2}})).problem(), COMM)
+    fine = Case.from_source({**data, "mesh": {"degree": 5, "refinement": 1.6}})
+    mesh = adapted(Case.from_source({**data, "mesh": {"tolerance": 1e-2}}).problem(), COMM)
     error = abs(mesh.best.result / by_path(Scene(fine, COMM)).value - 1)
     assert 1e-3 < error < mesh.best.estimate < 1e-2
 

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.magnetism.direction import field_at
 
 G = [[0.3, 0.2, 0.0], [0.2, 0.5, -0.4], [0.0, -0.4, -0.8]]
@@ -28,7 +27,7 @@ def ended(applied: dict[str, Any], loading: Any, model: str = "shell") -> tuple[
     if strength:
         mesh["size"] *= 0.02
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "loading": loading, "mesh": mesh}
-    scene = ms.Scene(ms.Case.from_source(Source("test", {**data, "symmetry": "none", "model": model})))
+    scene = ms.Scene(ms.Case.from_source({**data, "symmetry": "none", "model": model}))
     *_, last = ms.follow(scene)
     return scene, last.point.state
 

@@ -9,7 +9,6 @@ from scipy.interpolate import CubicSpline
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
@@ -59,7 +58,7 @@ FULL = ("a plate", "a magnet over gas")
 
 
 def scene_of(**sections: object) -> Scene:
-    return Scene(Case.from_source(Source("test", {**SHELL, **sections})))
+    return Scene(Case.from_source({**SHELL, **sections}))
 
 
 def rows(**sections: object) -> list[Record]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.runs.rows import columns
 
 OMEGA = 10.2158 * np.sqrt(1 / 12) / 50  # of a clamped disc (Leissa 1969), R/h = 50, nu = 0
@@ -17,7 +16,7 @@ CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_
 def found(shell: dict[str, Any], step: dict[str, Any], **others: Any) -> dict[str, Any]:
     """The columns of a motion."""
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3, "refinement": 0.5}} | others
-    scene = Scene(Case.from_source(Source("test", data | {"loading": [{"kind": "time", **step}]})))
+    scene = Scene(Case.from_source(data | {"loading": [{"kind": "time", **step}]}))
     return columns(scene, follow(scene))
 
 

@@ -8,7 +8,6 @@ import pytest
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 
 MATERIAL = {"thickness": 0.02, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
@@ -86,14 +85,14 @@ FINER = {
 
 
 def ended(problem: dict[str, Any], symmetry: str, mesh: dict[str, Any]) -> tuple[ms.Scene, dict[str, float]]:
-    scene = ms.Scene(ms.Case.from_source(Source("test", {**problem, "symmetry": symmetry, "mesh": mesh})))
+    scene = ms.Scene(ms.Case.from_source({**problem, "symmetry": symmetry, "mesh": mesh}))
     *_, last = ms.follow(scene)
     return scene, scene.observe(last.point.state)
 
 
 def first_wave(problem: dict[str, Any], **mesh: float) -> tuple[str, float]:
     """The first mode that the meridian excludes and its load."""
-    case = ms.Case.from_source(Source("test", {**problem, "mesh": mesh}))
+    case = ms.Case.from_source({**problem, "mesh": mesh})
     found = next(record for record in ms.follow(ms.Scene(case)) if record.mode)
     return found.mode, next(iter(found.point.state.mu.values()))
 
@@ -188,7 +187,7 @@ def test_waves_are_those_of_the_half_shell(boundary: dict[str, Any], loading: di
     shell = {**CYLINDER, "thickness": 0.03}
     problem = {"shell": shell, "boundary": boundary, "loading": {**loading, "until": "bifurcation"}}
     _, load = first_wave(problem, degree=4)
-    half = ms.Scene(ms.Case.from_source(Source("test", {**problem, "symmetry": "half", "mesh": {"size": 0.3}})))
+    half = ms.Scene(ms.Case.from_source({**problem, "symmetry": "half", "mesh": {"size": 0.3}}))
     name = "load" if half.problem.loads.dead else "pressure"
     below, above = 0.995 * load, 1.005 * load
     path = Path(half.newton, name, "load", StepOptions(below, below, 1e-3 * below))

@@ -12,7 +12,6 @@ from ufl.core.expr import Expr
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -42,7 +41,7 @@ def hinge(r0: Jet, u: Jet, edge: Edge) -> Expr:
 def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any) -> dict[str, float]:
     """What is observed at a small load of one amplitude."""
     data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.5}, **sections}
-    scene = ms.Scene(ms.Case.from_source(Source("test", data)), terms=terms)
+    scene = ms.Scene(ms.Case.from_source(data), terms=terms)
     *_, end = ms.trace(scene, amplitude, targets=[target])
     return scene.observe(end.point.state)
 

@@ -7,7 +7,6 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import Source
 
 PLATE = {"geometry": "plate", "length": 2, "width": 1, "thickness": 0.02, "youngs_modulus": 3.0, "poisson_ratio": 0.3}
 COARSE = {"refinement": 0.5}
@@ -16,7 +15,7 @@ CAP = {"geometry": "cap", "polar": 60, "radius": 2, "thickness": 0.04, "youngs_m
 
 def load(shell: dict[str, Any], *loads: dict[str, Any], **sections: Any) -> ms.Case:
     loading = {"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": list(loads)}
-    return ms.Case.from_source(Source("test", {"shell": shell, "loading": loading, **sections}))
+    return ms.Case.from_source({"shell": shell, "loading": loading, **sections})
 
 
 def end(case: ms.Case) -> dict[str, float]:
@@ -146,7 +145,7 @@ def test_potential_is_refused_where_it_is_none() -> None:
     for more, said in (({"over": "lid"}, "goes with over: all"), ({"over": "all"}, "a potential has none")):
         loading = {"kind": "dead", "control": "displacement", "displacement": 1, "loads": [{"potential": "z", **more}]}
         with pytest.raises(ms.CaseError, match=said):
-            ms.Case.from_source(Source("test", {"shell": CAP, "loading": loading, "boundary": {"rim": "clamped"}}))
+            ms.Case.from_source({"shell": CAP, "loading": loading, "boundary": {"rim": "clamped"}})
 
 
 @pytest.mark.parametrize(

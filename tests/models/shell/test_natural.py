@@ -14,7 +14,6 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
 from magshell_fenicsx.parts.natural.shape import Natural
@@ -27,7 +26,7 @@ DEGREES = {"none": {"degree": 3}, "half": {"degree": 3}, "axisymmetric": {"degre
 
 
 def load(**sections: Any) -> ms.Case:
-    return ms.Case.from_source(Source("test", sections))
+    return ms.Case.from_source(sections)
 
 
 def grow(scene: ms.Scene, *names: str) -> State:

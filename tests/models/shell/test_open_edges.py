@@ -13,7 +13,6 @@ from scipy.integrate import solve_bvp
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import Skewed, Tangent
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.hexahedra import OUTER, face_measure
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.solid import SolidModel
@@ -29,7 +28,7 @@ MODELS = [("shell", "none"), ("shell", "half"), ("shell", "axisymmetric"), ("sol
 def scene(shell: dict[str, Any], boundary: dict[str, Any], mesh: dict[str, Any], **more: Any) -> ms.Scene:
     loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05, "points": 1}
     data = {"shell": shell, "boundary": boundary, "loading": loading, "mesh": mesh, **more}
-    return ms.Scene(ms.Case.from_source(Source("test", data)))
+    return ms.Scene(ms.Case.from_source(data))
 
 
 def cylinder(top: Any, model: str, symmetry: str) -> ms.Scene:

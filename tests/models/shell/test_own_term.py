@@ -129,7 +129,7 @@ def test_whole_value_of_what_is_observed() -> None:
     data |= {"loading": {"kind": "dead", "loads": loads, "factor": 1, "points": 1}}
 
     def observed(symmetry: str, **columns: Density) -> tuple[str, dict[str, float]]:
-        case = Case.from_source(Source("test", data | {"symmetry": symmetry}))
+        case = Case.from_source(data | {"symmetry": symmetry})
         scene = Scene(case, terms=[OwnTerm("springs", winkler, value=1e-6, observed=columns)])
         *_, end = follow(scene)
         values = scene.observe(end.point.state)
@@ -333,7 +333,7 @@ def test_a_term_that_only_observes(model: str, symmetry: str) -> None:
         "symmetry": symmetry,
     }
     seen = {"mean_ux": lambda r0, u: 10 * u.r[0], "area": lambda r0, u: ufl.as_ufl(1.0)}
-    case = Case.from_source(Source("test", sections))
+    case = Case.from_source(sections)
     scene = Scene(case, terms=[OwnTerm("mean", None, observed=seen, of_volume=model == "solid")])
     *_, record = follow(scene)
     row = scene.observe(record.point.state)

@@ -7,7 +7,6 @@ import pytest
 from conftest import disc, hemisphere
 
 from magshell_fenicsx import Case, Scene, surface
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
@@ -83,7 +82,7 @@ def test_principal_values_are_eigenvalues() -> None:
 
 
 def scene_of(**sections: Any) -> Scene:
-    return Scene(Case.from_source(Source("test", sections)))
+    return Scene(Case.from_source(sections))
 
 
 def last(scene: Scene) -> Surface:

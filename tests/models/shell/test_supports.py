@@ -19,9 +19,7 @@ CORNERS = {"A": [0, 0, 0], "B": [1, 0, 0], "C": [0, 1, 0]}
 
 def scene(shell: dict[str, Any], boundary: dict[str, Any], points: dict[str, Any]) -> Scene:
     mesh = {"degree": 2, "size": 0.5}
-    return Scene(
-        Case.from_source(Source("test", {"shell": shell, "boundary": boundary, "points": points, "mesh": mesh}))
-    )
+    return Scene(Case.from_source({"shell": shell, "boundary": boundary, "points": points, "mesh": mesh}))
 
 
 @pytest.mark.parametrize(
@@ -132,7 +130,7 @@ def test_sectors_between_oblique_symmetry_planes() -> None:
     for first, last in ((0, 90), (-25, 35)):
         shell = {**CYLINDER, "youngs_modulus": 1, "azimuth": [first, last]}
         data = {"shell": shell, "boundary": edges, "loading": loading, "mesh": {"degree": 2, "size": 0.5236}}
-        *_, end = follow(sector := Scene(Case.from_source(Source("test", {**data, "symmetry": "none"}))))
+        *_, end = follow(sector := Scene(Case.from_source({**data, "symmetry": "none"})))
         found.append(sector.observe(end.point.state)["energy"] / (last - first))
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
@@ -142,7 +140,7 @@ def test_a_remanence_without_value_is_refused() -> None:
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "expression", "components": ["0*x", "0*x", "1/(3*x - 1)"]}}
     data = {"shell": PLATE, "boundary": {"left": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2, "size": 0.34}}
     with pytest.raises(CaseError, match=r"magnetic.remanent.components: .* is inf at .* \(0.333, "):
-        Scene(Case.from_source(Source("test", data)))
+        Scene(Case.from_source(data))
 
 
 def test_energy_of_mirror_edges_is_bending() -> None:
@@ -162,7 +160,7 @@ def test_displacement_beside_moments_alone() -> None:
     load = {"kind": "dead", "loads": [{"edge": "right", "moment": 1}], "factor": 1}
     shell, mesh = {**PLATE, "youngs_modulus": 1}, {"degree": 2, "size": 0.5}
     data = {"shell": shell, "boundary": {"left": "clamped"}, "points": CORNERS, "loading": load, "mesh": mesh}
-    beam = Scene(Case.from_source(Source("test", {**data, "points": {"B": CORNERS["B"]}})))
+    beam = Scene(Case.from_source({**data, "points": {"B": CORNERS["B"]}}))
     state = beam.unloaded()
     state.u.reshape(-1, 3)[:, 2] = -0.02
     assert beam.observe(state)["w_over_h"] == pytest.approx(1.0)

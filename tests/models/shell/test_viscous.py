@@ -10,7 +10,7 @@ from plies import ply, section
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.runs.rows import columns
 from magshell_fenicsx.shells.mass import mass
 from magshell_fenicsx.shells.viscous import Viscosity
@@ -21,7 +21,7 @@ OMEGA = 3.5160 * np.sqrt(1 / 12) / 50  # of a cantilever, R/h = 50, nu = 0
 def case_of(shell: dict[str, Any], step: dict[str, Any], symmetry: str = "half", degree: int = 3) -> Case:
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
     data = {"shell": strip | shell, "boundary": {"root": "clamped"}, "mesh": {"degree": degree, "size": 0.5}}
-    return Case.from_source(Source("test", data | {"symmetry": symmetry, "loading": [{"kind": "time", **step}]}))
+    return Case.from_source(data | {"symmetry": symmetry, "loading": [{"kind": "time", **step}]})
 
 
 def exact(polynomial: list[float], t: Any) -> Any:
@@ -159,7 +159,7 @@ def test_creep_after_a_ramp() -> None:
 def steps_of(shell: dict[str, Any], steps: list[dict[str, Any]]) -> Case:
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
     data = {"shell": strip | shell, "boundary": {"root": "clamped"}, "mesh": {"degree": 3, "size": 0.5}}
-    return Case.from_source(Source("test", data | {"symmetry": "half", "loading": steps}))
+    return Case.from_source(data | {"symmetry": "half", "loading": steps})
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_damped_vibration_of_a_natural_shape() -> None:
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
     data = {"boundary": {"root": "clamped"}, "natural": {"curvature": [1.0, 0, 0]}, "mesh": {"degree": 3, "size": 0.5}}
     grown: dict[str, Any] = {"kind": "natural", "curvature": 1.0, "control": "load", "points": 1}
-    still = Scene(Case.from_source(Source("test", data | {"shell": strip, "loading": [grown]})))
+    still = Scene(Case.from_source(data | {"shell": strip, "loading": [grown]}))
     *_, last = follow(still)
     system = still.model.system
     K, M = (csr(A).toarray() for A in (system.tangent(last.point.state.u, last.point.state.mu), mass(still.model)))
@@ -177,7 +177,7 @@ def test_damped_vibration_of_a_natural_shape() -> None:
     period, push = 2 * np.pi / omega, {"mode": 1, "displacement": 0.01}
     step = {"kind": "time", "duration": period / 2, "points": 2, "step": period / 80, "rho_inf": 1.0, "push": push}
     shell = strip | {"viscosity": 0.1 / omega}
-    scene = Scene(Case.from_source(Source("test", data | {"shell": shell, "loading": [grown, step]})))
+    scene = Scene(Case.from_source(data | {"shell": shell, "loading": [grown, step]}))
     found = columns(scene, follow(scene))
     moved = (found["w_over_h"] - scene.observe(last.point.state)["w_over_h"])[-2:] / 0.01
     damped = exact([1, 0.1, 1], np.arange(1, 3) * np.pi / 2)

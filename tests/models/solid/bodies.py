@@ -8,7 +8,6 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.hexahedra import Body, sweep
 from magshell_fenicsx.mesh.shapes import DiscShape, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
@@ -31,5 +30,5 @@ def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body
 def body_of(shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None) -> Body:
     """A body around a shell as a case describes it."""
     data = {"shell": {"poisson_ratio": 0.3, **shell}, "boundary": {}, "points": points or {}, "mesh": {"size": size}}
-    problem = make_problem(Case.from_source(Source("test", data)))
+    problem = make_problem(Case.from_source(data))
     return sweep(problem.triangulated(), problem.material.h, layers, MPI.COMM_SELF, factor)

@@ -38,7 +38,7 @@ def end(
     elements = {"size": size} if size else {}
     degree = {"degree": 3} if model == "shell" else {}
     data = {"model": model, "shell": {"poisson_ratio": nu, **shell}, "mesh": {**elements, **degree}, **sections}
-    scene = ms.Scene(ms.Case.from_source(Source("test", data)))
+    scene = ms.Scene(ms.Case.from_source(data))
     *_, last = ms.follow(scene)
     return scene.observe(last.point.state)
 
@@ -225,7 +225,7 @@ def test_a_layered_case_has_elements_for_its_layers() -> None:
     layers = [{"fraction": 0.3, "polar": 90}, {"fraction": 0.7}]
     magnetic = {"lambda_m": 1e-5, "remanent": {"kind": "layers", "layers": layers}}
     data = {"model": "solid", "shell": {"poisson_ratio": 0.3, **STRIP}, "boundary": CLAMPED, "magnetic": magnetic}
-    scene = ms.Scene(ms.Case.from_source(Source("test", {**data, "mesh": {"size": 0.5}})))
+    scene = ms.Scene(ms.Case.from_source({**data, "mesh": {"size": 0.5}}))
     assert isinstance(scene.model, SolidModel)
     assert np.unique(scene.model.body.between).tolist() == pytest.approx([0, 0.3, 0.5, 1])
     vectors = scene.model.loads.magnetic.remanent.vectors  # type: ignore[union-attr]
@@ -288,14 +288,14 @@ def test_a_body_that_overlaps_itself_is_refused() -> None:
         "mesh": {"size": 0.3},
     }
     with pytest.raises(MeshError, match="the body overlaps itself around"):
-        ms.Scene(ms.Case.from_source(Source("test", {**data, "boundary": {"bottom": "clamped"}})))
+        ms.Scene(ms.Case.from_source({**data, "boundary": {"bottom": "clamped"}}))
 
 
 def test_a_solid_that_is_free_is_refused() -> None:
     """Held at one line, it turns about it."""
     data = {"model": "solid", "shell": {"poisson_ratio": 0.3, **STRIP}, "boundary": {"left": "hinged"}}
     with pytest.raises(MeshError, match="it is free to"):
-        ms.Scene(ms.Case.from_source(Source("test", {**data, "mesh": {"size": 0.5}})))
+        ms.Scene(ms.Case.from_source({**data, "mesh": {"size": 0.5}}))
 
 
 def test_a_step_in_the_thickness_is_refused() -> None:

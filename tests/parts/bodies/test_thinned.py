@@ -9,7 +9,6 @@ from conftest import disc, hemisphere, random_displacement
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -83,7 +82,7 @@ def test_balloon_under_a_plate() -> None:
         "bodies": {"plate": {"kind": "plane", "position": [0, 0, 1.4]}},
         "loading": {"kind": "pressure", "control": "volume", "until": "target", "volume_change": 1.4, "points": 6},
     }
-    scene = ms.Scene(ms.Case.from_source(Source("test", sections)))
+    scene = ms.Scene(ms.Case.from_source(sections))
     *_, last = ms.follow(scene)
     model, state = scene.model, last.point.state
     r0, r = (x.reshape(-1, 2) for x in (model.r0.x.array, model.r0.x.array + state.u))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
@@ -46,7 +46,7 @@ def shaped(name: str, *imperfections: dict[str, Any], **others: Any) -> Case:
     else:
         shell |= {"thickness": H} | ({"radius": 1.0} if shape["geometry"] not in ("plate", "revolution") else {})
     data = {"shell": shell, "boundary": {edge: "clamped"} if edge else {}, "mesh": {"refinement": 0.5}, **others}
-    return Case.from_source(Source("test", {"loading": {"kind": "pressure"}, **data}))
+    return Case.from_source({"loading": {"kind": "pressure"}, **data})
 
 
 def dimple(*point: float, **others: Any) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from magshell_fenicsx.assembly.whole import WholeMatrix
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism import interacting
@@ -84,7 +84,7 @@ def case_of(file: Path, h: float, E: str = "1 MPa", **sections: Any) -> Case:
         "magnetic": {"interaction": "others", "remanent": {"polar": 0, "flux_density": f"{BR} T"}},
         "loading": {"kind": "interaction", "points": 2},
     }
-    return Case.from_source(Source("test", data | sections))
+    return Case.from_source(data | sections)
 
 
 def gradient(scene: Scene, u: Vector) -> Array:
@@ -338,7 +338,7 @@ def test_bad_input(model: Any, tmp_path: Path, magnetic: dict[str, Any], section
         "loading": {"kind": "interaction"},
     }
     with pytest.raises((CaseError, ValueError), match=said):
-        Scene(Case.from_source(Source("test", data | sections)))
+        Scene(Case.from_source(data | sections))
 
 
 def test_a_step_without_interaction_is_refused(model: Any, tmp_path: Path) -> None:

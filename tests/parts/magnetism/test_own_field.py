@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, field, moment
 from magshell_fenicsx.parts.registered import SEEN
@@ -190,7 +190,7 @@ def test_a_stretched_disc_of_rubber(law: str) -> None:
         "sensors": {"hall": {"position": [0, 0, "3 mm"]}},
         "loading": {"kind": "field"},
     }
-    scene = Scene(Case.from_source(Source("test", case)))
+    scene = Scene(Case.from_source(case))
     u = 0.5 * scene.model.r0.x.array[: scene.model.system.size]
     found = scene.observe(State(u, scene.unloaded().mu))["hall_Bz"]
     half, rim, size = h / 2.25 / 2, 1.5 * R, 1 / 2.25 if law == "deformation" else 1.0
