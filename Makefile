@@ -29,7 +29,7 @@ make lint             ruff and mypy
 make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
 make image            the Docker image magshell_fenicsx
-make clean            remove caches and compiled kernels; keeps .env/root* and results
+make clean            remove caches and compiled kernels; keeps .env/root*, .env/pypi* and results
 endef
 export HELP
 

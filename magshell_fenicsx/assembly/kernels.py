@@ -274,7 +274,9 @@ class KernelLog:
         Raises
         ------
         RuntimeError
-            On all ranks, if one of them cannot.
+            On all ranks, if one of them cannot write the folder of the kernels.
+        CalledProcessError
+            On all ranks, if a compiler fails.
         """
         raised_by_all(comm, self._finish)
 

@@ -41,6 +41,7 @@ USUAL = ("cc", "gcc", "clang")
 ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
 HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
 SMALLEST = "#include <math.h>\ndouble root(double x) { return sqrt(x); }\n"
+USED = ("-O3", "-ffast-math", "-fno-strict-overflow", "-std=gnu17")  # what kernels ask of any compiler, by kind
 CHECKED = "magshell_compiler_checked"  # of a cache for which a compiler has compiled
 
 
@@ -57,7 +58,10 @@ def c_compiler() -> tuple[str, ...]:
         If there is none.
     """
     if given := os.environ.get("CC"):
-        command = tuple(shlex.split(given))
+        try:
+            command = tuple(shlex.split(given))
+        except ValueError:  # a quotation without its end
+            command = ()
         if not command or not shutil.which(command[0]):
             raise NoCompiler(f"CC={given}: there is no such compiler; {HINT}")
         return command
@@ -103,7 +107,7 @@ def refuse_unusable() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
         code.write_text(SMALLEST, encoding="utf-8")
-        words = [*command, "-fPIC", "-shared", str(code), "-o", str(made), "-lm"]
+        words = [*command, *USED, *processor_options(), "-fPIC", "-shared", str(code), "-o", str(made), "-lm"]
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode and not FULL.search(done.stderr):
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
@@ -141,7 +145,9 @@ class Library:
         Raises
         ------
         RuntimeError
-            If the compiler has failed, or the folder of the kernels cannot be written.
+            If the folder of the kernels cannot be written.
+        CalledProcessError
+            If the compiler has failed.
         """
         if not self._kept and self._work and self._work.done():
             self._kept = self._work.result()
@@ -227,7 +233,9 @@ def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lam
     NoCompiler
         If there is none.
     RuntimeError
-        If one cannot be compiled; those that have not begun are given up.
+        If the folder of the kernels cannot be written.
+    CalledProcessError
+        If the compiler fails. Libraries that have not begun are given up.
     """
     try:
         while missing := [each for each in libraries if not each.there]:
@@ -280,8 +288,13 @@ def processor_options() -> tuple[str, ...]:
 
 
 def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
-    """Under a name of its own first, so that others find a whole library or none."""
+    """Compile a library under a name of its own first, so that others find a whole one or none.
+
+    Whoever has its lock removes what killed processes have left of it.
+    """
     compiler = c_compiler()
+    for left in file.parent.glob(f"{file.stem}????????/"):
+        shutil.rmtree(left, ignore_errors=True)
     with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")

@@ -167,6 +167,10 @@ def run(
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     with reported(_of_kernels(say, tell, start, apart=plain(comm.size))):
+        if pictures and folder and comm.rank == 0:
+            from magshell_fenicsx.output.pictures.view import library
+
+            library()  # before anything is solved: there may be no compiler
         if folder is None:
             return _run(problem, None, comm, say, tell, watch, start, pictures, resume=False)
         with held_folder(folder, comm, make=not resume):

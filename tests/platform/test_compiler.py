@@ -1,6 +1,7 @@
 """Libraries that several processes want at the same time, disks that are full, compilers of every kind and none."""
 
 import ctypes
+import shlex
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from command import started
 from conftest import CASES
 from mpi4py import MPI
 
+import magshell_fenicsx as ms
 from magshell_fenicsx.platform import compiler, kept
 from magshell_fenicsx.platform.compiler import NoCompiler
 from magshell_fenicsx.platform.native import native
@@ -82,12 +84,13 @@ def test_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many compilers as there are cores run at once, and no more."""
     beside, seen, program = tmp_path / "beside", tmp_path / "seen", tmp_path / "compiler"
     beside.mkdir()
-    program.write_text(MEETING.format(folder=beside, seen=seen) + 'exec cc "$@"\n', encoding="utf-8")
+    then_compiles = f'exec {shlex.join(compiler.c_compiler())} "$@"\n'
+    program.write_text(MEETING.format(folder=beside, seen=seen) + then_compiles, encoding="utf-8")
     program.chmod(0o755)
     monkeypatch.setenv("CC", str(program))
     told = list[int]()
-    compiler.side_by_side(libraries("a", "b"), told.append)
-    assert seen.read_text(encoding="utf-8").split() == ["2", "2"]
+    compiler.side_by_side(libraries("a", "b", "c", "d"), told.append)
+    assert max(map(int, seen.read_text(encoding="utf-8").split())) == 2
     assert told == sorted(told)
     assert told[0] == 0
 
@@ -208,4 +211,25 @@ def test_a_run_without_a_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("CC=none-of-all: there is no such compiler; install gcc or clang")
     assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out/path.csv").exists()
+
+
+@pytest.mark.parametrize("given", ["'gcc", "{refusing}"])
+def test_compilers_that_are_refused(given: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quotation without its end, and a compiler that lacks an option of the kernels."""
+    text = '#!/bin/sh\ncase "$*" in *-std=*) echo "error: unknown option" >&2; exit 1 ;; esac\nexec cc "$@"\n'
+    monkeypatch.setenv("CC", given.format(refusing=program(tmp_path, "refusing", text)))
+    with pytest.raises(NoCompiler, match=r"there is no such compiler|refusing cannot compile: error: unknown option"):
+        compiler.check_compiler()
+
+
+def test_pictures_have_their_code_before_anything_is_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a compiler has been there before, and not for this."""
+
+    def without_compiler() -> None:
+        raise NoCompiler("there is none")
+
+    monkeypatch.setattr("magshell_fenicsx.output.pictures.view.library", without_compiler)
+    with pytest.raises(NoCompiler, match="there is none"):
+        ms.run(CASES / "clamped_plate.yaml", tmp_path / "out")
     assert not (tmp_path / "out/path.csv").exists()

@@ -109,16 +109,17 @@ def a_folder(out: Path) -> None:
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)
 
 
-ALONE = (what_rank_0_gets, any_error, files, what_cannot_be_sent, what_one_rank_cannot, reads, meshes)
+OF_ERRORS = (what_rank_0_gets, any_error, files, what_cannot_be_sent, what_one_rank_cannot)
+OF_SCENES = (reads, meshes)
 
 
-@pytest.mark.slow
-def test_every_rank_gets_what_the_first_does(tmp_path: Path) -> None:
+@pytest.mark.parametrize("asked", ["errors", pytest.param("scenes", marks=pytest.mark.slow)])
+def test_every_rank_gets_what_the_first_does(asked: str, tmp_path: Path) -> None:
     """Where a rank would wait for ever, a timeout ends the test."""
     launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", "2", sys.executable]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(
-        [*launcher, __file__, str(tmp_path)],
+        [*launcher, __file__, asked, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
@@ -141,7 +142,8 @@ def test_a_bug_in_pictures_is_told_at_the_end(tmp_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    for check in ALONE:
+    for check in OF_ERRORS if sys.argv[1] == "errors" else OF_SCENES:
         check()
-    a_folder(Path(sys.argv[1]))
+    if sys.argv[1] == "scenes":
+        a_folder(Path(sys.argv[2]))
     print("done", flush=True)
