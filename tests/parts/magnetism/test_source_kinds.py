@@ -17,6 +17,7 @@ from magshell_fenicsx import Case, CaseError, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.magnetism.applied import crossing
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
 from magshell_fenicsx.simulate.follow import follow
@@ -54,7 +55,7 @@ RANDOM = np.random.default_rng(5).uniform([0, -0.2, -0.3], [1.0, 0.2, 0.5], (40,
 def case(sources: list[dict[str, Any]], folder: Path | None = None, **sections: Any) -> Case:
     magnetic = {"remanent": {"polar": 90, "flux_density": "50 mT"}, "applied": {"sources": sources}}
     data = {**STRIP, "magnetic": magnetic, **sections}
-    return Case.from_source(data, folder=folder or Path())
+    return Case.from_source(Source("test", data, folder=folder or Path()))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -149,7 +150,7 @@ def test_sum(tmp_path: Path) -> None:
     for key in ("radius", "thickness"):
         data["shell"][key] = f"{data['shell'][key]} m"
     data["shell"]["youngs_modulus"] = "1 MPa"
-    still, driven = in_space(Case.from_source(data, folder=tmp_path).context)
+    still, driven = in_space(Case.from_source(Source("test", data, folder=tmp_path)).context)
     assert still
     assert not driven
     x = RANDOM * [0.9, 0.8, 0.9]
