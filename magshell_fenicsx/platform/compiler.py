@@ -298,9 +298,15 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")
-        command = [*compiler, *options, "-fPIC", "-shared", str(code), "-o", str(made), "-lm"]
-        done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
-        print(done.stderr, end="", file=sys.stderr)
+        to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
+        # apart and without options: with -ffast-math older compilers link code that flushes denormal numbers of the
+        # whole process to zero as the library is loaded
+        to_library = [*compiler, "-shared", f"{code}.o", "-o", str(made), "-lm"]
+        for command in (to_object, to_library):
+            done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
+            print(done.stderr, end="", file=sys.stderr)
+            if done.returncode:
+                break
         if done.returncode and (full := FULL.search(done.stderr)):  # of its own, or of the folder for temporary files
             raise OSError(0, full[0])
         if done.returncode:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import started
 from conftest import CASES
@@ -233,3 +234,11 @@ def test_pictures_have_their_code_before_anything_is_solved(tmp_path: Path, monk
     with pytest.raises(NoCompiler, match="there is none"):
         ms.run(CASES / "clamped_plate.yaml", tmp_path / "out")
     assert not (tmp_path / "out/path.csv").exists()
+
+
+@pytest.mark.usefixtures("cache")
+def test_denormal_numbers_stay_what_they_are() -> None:
+    """A library that is compiled with -ffast-math changes nothing beside it as it is loaded."""
+    least = np.array([5e-324])
+    ctypes.CDLL(str(compiler.Library("denormal", lambda: SOURCE, ("-O1", "-ffast-math")).path()))
+    assert least * np.ones(1) > 0
