@@ -272,8 +272,8 @@ def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str
             found, complete = killer(copy, cache, of_suite, seconds)
             if found:
                 file.write_bytes(text)
-                names_of_test = [test for test in of_suite if test.test == found]
-                false_alarm, _ = killer(copy, cache, names_of_test, seconds)
+                killing_tests = [test for test in of_suite if test.test == found]
+                false_alarm, _ = killer(copy, cache, killing_tests, seconds)
                 return (found, suite) if not false_alarm else ("none", f"{found} fails without it too")
             every &= complete
     return "none", f"all {len(reaching)} tests" if every else f"of {len(reaching)} tests those within the time"

@@ -30,7 +30,7 @@ from magshell_fenicsx.platform.processes import raised_by_all
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
 # -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
 FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
-SHORT = 1.0  # s of compilation that nobody need be told of
+SILENT_SECONDS = 1.0  # of compilation that nobody need be told of
 
 Key = tuple[str, str, int]
 
@@ -126,7 +126,7 @@ def _bound(
 
 
 def _domain_of(form: ufl.Form) -> ufl.Mesh:
-    """What it is integrated over."""
+    """Return the mesh that a form is integrated over."""
     (domain,) = form.subdomain_data()
     return domain
 
@@ -145,7 +145,7 @@ def _entries(form: ufl.Form) -> int:
 
 @dataclass
 class Status:
-    """What is told while kernels are compiled: how many of how many; by default to nobody."""
+    """Progress of compilation: how many kernels of how many; by default nobody hears it."""
 
     tell: Callable[[str], None] = lambda _: None
     done: int = 0
@@ -156,17 +156,17 @@ class Status:
         if not libraries:
             return
         begin = time.perf_counter()
-        last = 0, begin + SHORT - RENEWED
+        last = 0, begin + SILENT_SECONDS - RENEWED
         self.known += len(libraries)
 
-        def told(there: int) -> None:
+        def tell_progress(there: int) -> None:
             nonlocal last
             now, (before, then) = time.perf_counter(), last
-            if now - begin >= SHORT and (there != before or now - then >= RENEWED):
+            if now - begin >= SILENT_SECONDS and (there != before or now - then >= RENEWED):
                 last = there, now
                 self.tell(f"compiling kernels (once) {self.done + there} of {self.known}")
 
-        side_by_side(libraries, told)
+        side_by_side(libraries, tell_progress)
         self.done += len(libraries)
 
 
@@ -185,7 +185,7 @@ def reported(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class _Begun:
+class _RequestedLibrary:
     """A library that is asked for, and how many numbers its function gives."""
 
     library: Library
@@ -198,7 +198,7 @@ class KernelLog:
 
     names: list[str] = field(default_factory=list)
     seconds: float = 0.0
-    _begun: dict[str, _Begun] = field(default_factory=dict)
+    _begun: dict[str, _RequestedLibrary] = field(default_factory=dict)
 
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
         """A compiled form; collective."""
@@ -206,16 +206,16 @@ class KernelLog:
 
     def derived(self, name: str, form: Derived) -> fem.Form:
         """A compiled form; collective."""
-        (compiled,) = self._all({name: form})
+        (compiled,) = self._compiled_together({name: form})
         return compiled
 
     def compile_all(self, named: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
         """Compiled forms under their names; collective."""
         forms = {name: form for each in named for name, form in each.items()}
-        compiled = self._all({name: itself(form) for name, form in forms.items()})
+        compiled = self._compiled_together({name: itself(form) for name, form in forms.items()})
         return dict(zip(forms, compiled, strict=True))
 
-    def _all(self, named: Mapping[str, Derived]) -> list[fem.Form]:
+    def _compiled_together(self, named: Mapping[str, Derived]) -> list[fem.Form]:
         begun = [self.begin(name, form) for name, form in named.items()]
         given = [form.of for form in named.values() if isinstance(form.of, ufl.Form) and not form.of.empty()]
         if given:
@@ -223,7 +223,7 @@ class KernelLog:
         return [compiled() for compiled in begun]
 
     def begin(self, name: str, form: Derived) -> Callable[[], fem.Form]:
-        """What gives a compiled form: from this process, from the cache or from the compiler."""
+        """Return a function that gives the compiled form: from this process, from the cache or from the compiler."""
         start, key = time.perf_counter(), form.key
         try:
             if key in _compiled_forms:
@@ -248,7 +248,7 @@ class KernelLog:
     def load(
         self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """What gives a library, whose function gives `size` numbers. See `Library`."""
+        """Return a function that gives a library, whose function gives `size` numbers. See `Library`."""
         start = time.perf_counter()
         library = self._library(key, source, options, size)
         self._note(name, start)
@@ -258,7 +258,7 @@ class KernelLog:
         self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
         library = Library(key, source, options)
-        begun = self._begun.setdefault(library.file, _Begun(library, size))
+        begun = self._begun.setdefault(library.file, _RequestedLibrary(library, size))
 
         @cache
         def loaded() -> ctypes.CDLL:

@@ -46,7 +46,7 @@ def _form_options() -> dict[str, Any]:
 
 
 def form_signature(form: ufl.Form) -> str:
-    """What the code of a form depends on."""
+    """Return the name of all that the code of a form depends on."""
     return str(naming.compute_signature([form], str(sorted(_form_options().items()))))
 
 

@@ -107,8 +107,7 @@ def refuse_unusable() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
         code.write_text(SMALLEST, encoding="utf-8")
-        words = [*command, *USED, *processor_options(), "-fPIC", "-shared", str(code), "-o", str(made), "-lm"]
-        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+        done = _compiler_run(command, (*USED, *processor_options()), code, made)
     if done.returncode and not FULL.search(done.stderr):
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         error = next((line for line in lines if "error" in line), lines[0]).replace(f"{scratch}/", "")
@@ -287,6 +286,24 @@ def processor_options() -> tuple[str, ...]:
     return ()
 
 
+def _compiler_run(
+    compiler: tuple[str, ...], options: tuple[str, ...], code: Path, library: Path
+) -> subprocess.CompletedProcess[str]:
+    """Compile a file of C and link its library; return the process that failed, or the last one.
+
+    They are linked apart and without options: with -ffast-math older compilers link code that flushes denormal numbers
+    of the whole process to zero as the library is loaded.
+    """
+    to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
+    to_library = [*compiler, "-shared", f"{code}.o", "-o", str(library), "-lm"]
+    compiled = subprocess.run(to_object, capture_output=True, text=True, errors="replace", check=False)
+    if compiled.returncode:
+        return compiled
+    linked = subprocess.run(to_library, capture_output=True, text=True, errors="replace", check=False)
+    linked.stderr = compiled.stderr + linked.stderr
+    return linked
+
+
 def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     """Compile a library under a name of its own first, so that others find a whole one or none.
 
@@ -298,15 +315,8 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")
-        to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
-        # apart and without options: with -ffast-math older compilers link code that flushes denormal numbers of the
-        # whole process to zero as the library is loaded
-        to_library = [*compiler, "-shared", f"{code}.o", "-o", str(made), "-lm"]
-        for command in (to_object, to_library):
-            done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
-            print(done.stderr, end="", file=sys.stderr)
-            if done.returncode:
-                break
+        done = _compiler_run(compiler, options, code, made)
+        print(done.stderr, end="", file=sys.stderr)
         if done.returncode and (full := FULL.search(done.stderr)):  # of its own, or of the folder for temporary files
             raise OSError(0, full[0])
         if done.returncode:

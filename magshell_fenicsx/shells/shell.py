@@ -214,7 +214,7 @@ class ShellModel(Thin):
                 terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
                 on_edge = held_on(V, 1, midsurface.edges[name], components)
-                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", of_what="plane")
+                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", kind="plane")
                 continue
             edge, turn = "", None
             if name in clamped:
@@ -232,8 +232,8 @@ class ShellModel(Thin):
             else:
                 conditions_of_part = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
             held += conditions_of_part
-            of_what: SupportKind = "point" if name in midsurface.points else "part"
-            self.supports[name] = Support.of(conditions_of_part, edge, turn, of_what=of_what)
+            kind: SupportKind = "point" if name in midsurface.points else "part"
+            self.supports[name] = Support.of(conditions_of_part, edge, turn, kind=kind)
         self.supports |= on_planes
         self.planes = tuple(planes)
         closing = closing_point(planes)

@@ -66,7 +66,7 @@ def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monke
 def test_what_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How many kernels are there, of all that were begun; nothing where all are there."""
     monkeypatch.setattr(kept, "_usual", lambda: tmp_path)
-    monkeypatch.setattr(kernels, "SHORT", 0.0)
+    monkeypatch.setattr(kernels, "SILENT_SECONDS", 0.0)
     told, log = list[str](), KernelLog()
 
     def values() -> list[float]:

@@ -29,15 +29,15 @@ class Support:
         Name of the term that holds the normal of a clamped edge; "" without.
     turn
         The rotation in that term, if a motion turns the edge.
-    of_what
-        What holds: a point, a part (an edge or a patch), or a mirror plane, in the direction of its normal alone. Of
+    kind
+        Whether it is a point, a part (an edge or a patch), or a mirror plane, in the direction of its normal alone. Of
         the supports that hold a component, those that come first in `PRECEDENCE` have its force.
     """
 
     dofs: NDArray[np.int32]
     edge: str = ""
     turn: fem.Constant | None = None
-    of_what: SupportKind = "part"
+    kind: SupportKind = "part"
 
     @classmethod
     def of(
@@ -46,10 +46,10 @@ class Support:
         edge: str = "",
         turn: fem.Constant | None = None,
         *,
-        of_what: SupportKind = "part",
+        kind: SupportKind = "part",
     ) -> "Support":
         dofs = [bc.dof_indices()[0] for bc in held]
-        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, of_what)
+        return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, kind)
 
 
 def motions_of(loads: Loads, name: str) -> Sequence[Motion]:

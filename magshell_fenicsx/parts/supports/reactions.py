@@ -100,7 +100,7 @@ def _shares(model: "Observed") -> dict[str, Array]:
     shares = {name: np.zeros(size) for name in model.supports}
     without_support = np.ones(size, dtype=bool)
     for kind in PRECEDENCE:
-        names = [name for name, support in model.supports.items() if support.of_what == kind]
+        names = [name for name, support in model.supports.items() if support.kind == kind]
         for name in names:
             dofs = model.supports[name].dofs
             shares[name][dofs[dofs < size]] = 1.0

@@ -294,7 +294,7 @@ def supports(
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
-            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), of_what="plane")
+            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), kind="plane")
             continue
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
@@ -303,7 +303,7 @@ def supports(
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
         held += conditions_of_part
-        named[name] = Support.of(conditions_of_part, of_what="point" if name in body.points else "part")
+        named[name] = Support.of(conditions_of_part, kind="point" if name in body.points else "part")
     return held, planes, named | on_planes
 
 
