@@ -27,7 +27,8 @@ TABLES = {obstacle.case: obstacle for obstacle in OBSTACLES}
 
 def distances(file: str, *settings: str) -> dict[str, float]:
     """Of each quantity, along the curve."""
-    obstacle, rows = TABLES[file.removesuffix(".yaml")], result_of_whole_path(file, *settings).rows
+    obstacle = TABLES[Path(file).stem]
+    rows = result_of_whole_path(file, *settings).rows
     return {
         column: along_curve(computed(rows, ours), published(obstacle.table, column))
         for column, ours in obstacle.columns.items()
@@ -36,7 +37,7 @@ def distances(file: str, *settings: str) -> dict[str, float]:
 
 def test_cantilever_under_end_shear() -> None:
     """The inextensible elastica to 1e-4 of the largest displacement; the strip stretches by F/(E h b) = 3e-5."""
-    rows = result_of_whole_path("cantilever_end_shear.yaml", "loading.points=4").rows
+    rows = result_of_whole_path("benchmarks/cantilever_end_shear.yaml", "loading.points=4").rows
     for column, ours in {"minus_u_tip_elastica_computed": "-A_ux", "w_tip_elastica_computed": "A_uz"}.items():
         error = at_equal_load(computed(rows, ours), published("cantilever_end_shear", column))
         assert error is not None
@@ -46,7 +47,7 @@ def test_cantilever_under_end_shear() -> None:
 @SLOW
 def test_cantilever_rolled_up_by_an_end_moment() -> None:
     """A full circle: u = L (sin(a)/a - 1), w = L (1 - cos(a))/a."""
-    rows = result_of_whole_path("cantilever_end_moment.yaml").rows
+    rows = result_of_whole_path("benchmarks/cantilever_end_moment.yaml").rows
     for row in rows:
         alpha = 2 * np.pi * float(row["load_factor"])
         if alpha:
@@ -66,9 +67,17 @@ def test_cantilever_rolled_up_by_an_end_moment() -> None:
 @pytest.mark.parametrize(
     ("file", "settings", "most"),
     [
-        ("slit_annular_plate.yaml", ["loading.points=10"], 5e-3),
-        ("hemisphere_hole.yaml", ["loading.points=10"], 1e-2),  # 0.41 % on the next finer mesh: docs/benchmarks
-        ("pinched_semicylinder.yaml", ["loading.factor=0.3", "loading.points=3"], 1e-2),  # its last part takes most
+        ("benchmarks/slit_annular_plate.yaml", ["loading.points=10"], 5e-3),
+        (
+            "benchmarks/hemisphere_hole.yaml",
+            ["loading.points=10"],
+            1e-2,
+        ),  # 0.41 % on the next finer mesh: docs/benchmarks
+        (
+            "benchmarks/pinched_semicylinder.yaml",
+            ["loading.factor=0.3", "loading.points=3"],
+            1e-2,
+        ),  # its last part takes most
     ],
 )
 def test_curve(file: str, settings: list[str], most: float) -> None:
@@ -78,7 +87,7 @@ def test_curve(file: str, settings: list[str], most: float) -> None:
 @SLOW
 def test_pulled_out_cylinder() -> None:
     """B and C to 0.5 %; under the force itself a Koiter shell gives 1.6 % less (docs/benchmarks)."""
-    found = distances("cylinder_pullout.yaml", "loading.points=10")
+    found = distances("benchmarks/cylinder_pullout.yaml", "loading.points=10")
     assert found["minus_u_B"] < 5e-3
     assert found["minus_u_C"] < 5e-3
     assert found["w_A"] < 2e-2
@@ -87,7 +96,7 @@ def test_pulled_out_cylinder() -> None:
 @SLOW
 def test_pinched_cylinder_up_to_a_tenth_of_the_load() -> None:
     """Before wrinkles, where the table can be trusted: 1 % of the largest displacement, and 0.2 % from CalculiX."""
-    begun = ("pinched_cylinder.yaml", "loading.factor=0.1", "loading.points=4")
+    begun = ("benchmarks/pinched_cylinder.yaml", "loading.factor=0.1", "loading.points=4")
     assert max(distances(*begun).values()) < 1e-2
     obstacle = TABLES["pinched_cylinder"]
     for column, calculix in second_opinion(obstacle).items():
@@ -96,7 +105,8 @@ def test_pinched_cylinder_up_to_a_tenth_of_the_load() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("file", "folds"), [("hinged_roof_12.7.yaml", [0.7421, 0.1729]), ("hinged_roof_6.35.yaml", [0.1953, -0.1288])]
+    ("file", "folds"),
+    [("benchmarks/hinged_roof_12.7.yaml", [0.7421, 0.1729]), ("benchmarks/hinged_roof_6.35.yaml", [0.1953, -0.1288])],
 )
 def test_roofs_snap_through_and_back(file: str, folds: list[float]) -> None:
     """The whole path by arc length, within 1 %; its folds at the largest and smallest loads of the table.

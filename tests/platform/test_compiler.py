@@ -86,9 +86,11 @@ def test_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     beside, seen, program = tmp_path / "beside", tmp_path / "seen", tmp_path / "compiler"
     beside.mkdir()
     then_compiles = f'exec {shlex.join(compiler.c_compiler())} "$@"\n'
-    program.write_text(MEETING.format(folder=beside, seen=seen) + then_compiles, encoding="utf-8")
+    program.write_text(
+        MEETING.format(folder=shlex.quote(str(beside)), seen=shlex.quote(str(seen))) + then_compiles, encoding="utf-8"
+    )
     program.chmod(0o755)
-    monkeypatch.setenv("CC", str(program))
+    monkeypatch.setenv("CC", shlex.quote(str(program)))
     told = list[int]()
     compiler.side_by_side(libraries("a", "b", "c", "d"), told.append)
     assert max(map(int, seen.read_text(encoding="utf-8").split())) == 2
@@ -184,7 +186,7 @@ def test_a_compiler_that_is_not_gcc(cache: Path, tmp_path: Path, monkeypatch: py
     gcc = shutil.which("gcc")
     if not gcc or not compiler.is_gnu((gcc,)):
         pytest.skip("no GCC here")
-    monkeypatch.setenv("CC", str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc))).replace(" ", "\\ "))
+    monkeypatch.setenv("CC", shlex.quote(str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc)))))
     (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
     assert native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)[1].seven() == 7
     assert ctypes.CDLL(str(compiler.Library("seven", lambda: SOURCE, ("-O0",)).path())).seven() == 7
@@ -193,7 +195,7 @@ def test_a_compiler_that_is_not_gcc(cache: Path, tmp_path: Path, monkeypatch: py
 def test_a_compiler_that_compiles_nothing(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its first error is said, before anything is solved. Where kernels have been compiled, none is needed."""
     lacking = "#!/bin/sh\necho 'in file\nmath.h: fatal error: no such file' >&2\nexit 1\n"
-    monkeypatch.setenv("CC", str(program(tmp_path, "cc", lacking)))
+    monkeypatch.setenv("CC", shlex.quote(str(program(tmp_path, "cc", lacking))))
     (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
     said = r"cc.* cannot compile: math\.h: fatal error: no such file; install"
     with pytest.raises(NoCompiler, match=said):
@@ -219,8 +221,8 @@ def test_a_run_without_a_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_compilers_that_are_refused(given: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A quotation without its end, and a compiler that lacks an option of the kernels."""
     text = '#!/bin/sh\ncase "$*" in *-std=*) echo "error: unknown option" >&2; exit 1 ;; esac\nexec cc "$@"\n'
-    monkeypatch.setenv("CC", given.format(refusing=program(tmp_path, "refusing", text)))
-    with pytest.raises(NoCompiler, match=r"there is no such compiler|refusing cannot compile: error: unknown option"):
+    monkeypatch.setenv("CC", given.format(refusing=shlex.quote(str(program(tmp_path, "refusing", text)))))
+    with pytest.raises(NoCompiler, match=r"there is no such compiler|refusing'? cannot compile: error: unknown option"):
         compiler.check_compiler()
 
 
