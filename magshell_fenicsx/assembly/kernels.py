@@ -8,6 +8,7 @@ signature of the form that it is derived from: for the next scene UFL neither di
 """
 
 import ctypes
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,13 +25,14 @@ from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.platform.compiler import RENEWED, Library, side_by_side
-from magshell_fenicsx.platform.processes import raised_by_all
+from magshell_fenicsx.platform.processes import raised_by_all, world
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
 # -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
 FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
 SILENT_SECONDS = 1.0  # of compilation that nobody need be told of
+REPEAT_SECONDS = 30.0  # between two lines on standard error
 
 Key = tuple[str, str, int]
 
@@ -143,11 +145,24 @@ def _entries(form: ufl.Form) -> int:
     return int(prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts))
 
 
+def _print_to_stderr() -> Callable[[str], None]:
+    """Return a function that prints a line on rank 0, unless it has printed one in the last `REPEAT_SECONDS`."""
+    last = -REPEAT_SECONDS
+
+    def tell(line: str) -> None:
+        nonlocal last
+        if world().rank == 0 and time.perf_counter() - last >= REPEAT_SECONDS:
+            last = time.perf_counter()
+            print(line, file=sys.stderr, flush=True)
+
+    return tell
+
+
 @dataclass
 class Status:
-    """Progress of compilation: how many kernels of how many; by default nobody hears it."""
+    """Progress of compilation: how many kernels of how many."""
 
-    tell: Callable[[str], None] = lambda _: None
+    tell: Callable[[str], None] = field(default_factory=_print_to_stderr)
     done: int = 0
     known: int = 0
 

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -165,8 +166,9 @@ def run(
     if folder and not problem.document.data:
         raise CaseError("out: a run is known again by what it writes of its case: give the problem a 'document'")
     watch = Watch(comm, start, time_limit, signals=out is not None)
+    listened = tell is not None
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
-    with reported(_of_kernels(say, tell, start, apart=plain(comm.size))):
+    with reported(_of_kernels(say, tell, start, apart=plain(comm.size))) if listened else nullcontext():
         if pictures and folder and comm.rank == 0:
             from magshell_fenicsx.output.pictures.view import library
 

@@ -63,6 +63,16 @@ def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monke
     assert not np.allclose(alone[-1], first[-1], rtol=1e-2, atol=0)
 
 
+def test_progress_where_nobody_listens(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Scenes in Python, sweeps, boundaries: a line on standard error, and the next one half a minute later."""
+    clock = iter([40.0, 40.0, 50.0, 70.0, 70.0])
+    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(clock))
+    status = kernels.Status()
+    for line in ("first", "soon after", "later"):
+        status.tell(line)
+    assert capsys.readouterr() == ("", "first\nlater\n")
+
+
 def test_what_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How many kernels are there, of all that were begun; nothing where all are there."""
     monkeypatch.setattr(kept, "_usual", lambda: tmp_path)

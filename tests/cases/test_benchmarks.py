@@ -21,14 +21,21 @@ from benchmarks.obstacles import (
 from benchmarks.obstacles_table import Line
 from solved import result_of_whole_path
 
+from magshell_fenicsx.runs.summary import Result
+
 SLOW = pytest.mark.slow
 TABLES = {obstacle.case: obstacle for obstacle in OBSTACLES}
 
 
+def benchmark(file: str, *settings: str) -> Result:
+    """Return the result of a file of cases/benchmarks/ that is run to its end."""
+    return result_of_whole_path(f"benchmarks/{file}", *settings)
+
+
 def distances(file: str, *settings: str) -> dict[str, float]:
     """Of each quantity, along the curve."""
-    obstacle = TABLES[Path(file).stem]
-    rows = result_of_whole_path(file, *settings).rows
+    obstacle = TABLES[file.removesuffix(".yaml")]
+    rows = benchmark(file, *settings).rows
     return {
         column: along_curve(computed(rows, ours), published(obstacle.table, column))
         for column, ours in obstacle.columns.items()
@@ -37,7 +44,7 @@ def distances(file: str, *settings: str) -> dict[str, float]:
 
 def test_cantilever_under_end_shear() -> None:
     """The inextensible elastica to 1e-4 of the largest displacement; the strip stretches by F/(E h b) = 3e-5."""
-    rows = result_of_whole_path("benchmarks/cantilever_end_shear.yaml", "loading.points=4").rows
+    rows = benchmark("cantilever_end_shear.yaml", "loading.points=4").rows
     for column, ours in {"minus_u_tip_elastica_computed": "-A_ux", "w_tip_elastica_computed": "A_uz"}.items():
         error = at_equal_load(computed(rows, ours), published("cantilever_end_shear", column))
         assert error is not None
@@ -47,7 +54,7 @@ def test_cantilever_under_end_shear() -> None:
 @SLOW
 def test_cantilever_rolled_up_by_an_end_moment() -> None:
     """A full circle: u = L (sin(a)/a - 1), w = L (1 - cos(a))/a."""
-    rows = result_of_whole_path("benchmarks/cantilever_end_moment.yaml").rows
+    rows = benchmark("cantilever_end_moment.yaml").rows
     for row in rows:
         alpha = 2 * np.pi * float(row["load_factor"])
         if alpha:
@@ -67,17 +74,9 @@ def test_cantilever_rolled_up_by_an_end_moment() -> None:
 @pytest.mark.parametrize(
     ("file", "settings", "most"),
     [
-        ("benchmarks/slit_annular_plate.yaml", ["loading.points=10"], 5e-3),
-        (
-            "benchmarks/hemisphere_hole.yaml",
-            ["loading.points=10"],
-            1e-2,
-        ),  # 0.41 % on the next finer mesh: docs/benchmarks
-        (
-            "benchmarks/pinched_semicylinder.yaml",
-            ["loading.factor=0.3", "loading.points=3"],
-            1e-2,
-        ),  # its last part takes most
+        ("slit_annular_plate.yaml", ["loading.points=10"], 5e-3),
+        ("hemisphere_hole.yaml", ["loading.points=10"], 1e-2),  # 0.41 % on the next finer mesh: docs/benchmarks
+        ("pinched_semicylinder.yaml", ["loading.factor=0.3", "loading.points=3"], 1e-2),  # its last part takes most
     ],
 )
 def test_curve(file: str, settings: list[str], most: float) -> None:
@@ -87,7 +86,7 @@ def test_curve(file: str, settings: list[str], most: float) -> None:
 @SLOW
 def test_pulled_out_cylinder() -> None:
     """B and C to 0.5 %; under the force itself a Koiter shell gives 1.6 % less (docs/benchmarks)."""
-    found = distances("benchmarks/cylinder_pullout.yaml", "loading.points=10")
+    found = distances("cylinder_pullout.yaml", "loading.points=10")
     assert found["minus_u_B"] < 5e-3
     assert found["minus_u_C"] < 5e-3
     assert found["w_A"] < 2e-2
@@ -96,17 +95,17 @@ def test_pulled_out_cylinder() -> None:
 @SLOW
 def test_pinched_cylinder_up_to_a_tenth_of_the_load() -> None:
     """Before wrinkles, where the table can be trusted: 1 % of the largest displacement, and 0.2 % from CalculiX."""
-    begun = ("benchmarks/pinched_cylinder.yaml", "loading.factor=0.1", "loading.points=4")
+    begun = ("pinched_cylinder.yaml", "loading.factor=0.1", "loading.points=4")
     assert max(distances(*begun).values()) < 1e-2
     obstacle = TABLES["pinched_cylinder"]
     for column, calculix in second_opinion(obstacle).items():
-        assert along_curve(computed(result_of_whole_path(*begun).rows, obstacle.columns[column]), calculix) < 2e-3
+        assert along_curve(computed(benchmark(*begun).rows, obstacle.columns[column]), calculix) < 2e-3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "folds"),
-    [("benchmarks/hinged_roof_12.7.yaml", [0.7421, 0.1729]), ("benchmarks/hinged_roof_6.35.yaml", [0.1953, -0.1288])],
+    [("hinged_roof_12.7.yaml", [0.7421, 0.1729]), ("hinged_roof_6.35.yaml", [0.1953, -0.1288])],
 )
 def test_roofs_snap_through_and_back(file: str, folds: list[float]) -> None:
     """The whole path by arc length, within 1 %; its folds at the largest and smallest loads of the table.
@@ -114,7 +113,7 @@ def test_roofs_snap_through_and_back(file: str, folds: list[float]) -> None:
     Those are samples of a path: a fold lies a little beyond.
     """
     assert max(distances(file).values()) < 1e-2
-    found = [point["value"] for point in result_of_whole_path(file).limit_points if point["kind"] == "fold"]
+    found = [point["value"] for point in benchmark(file).limit_points if point["kind"] == "fold"]
     assert found == pytest.approx(folds, abs=5e-3)
 
 
