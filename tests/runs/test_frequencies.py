@@ -190,6 +190,7 @@ def test_full_shell_has_both_symmetries() -> None:
     assert [value for _, value in full] == pytest.approx([value for _, value in half], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_solid_disc_converges() -> None:
     """The lowest frequency of a clamped solid disc, R/h = 20, comes from above and closer with each refinement."""
     shell = {"geometry": "disc", "radius_to_thickness": 20, "poisson_ratio": 0.3}

@@ -103,7 +103,8 @@ def test_hertz(tmp_path: Path) -> None:
     assert found["lambda_m"] == pytest.approx(by_square * hertz / (2 * omega2(scene, last, "omega2_1")), rel=1e-9)
 
 
-@pytest.mark.parametrize("hold", ["load", pytest.param("conjugate", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", ["load", "conjugate"])
 def test_barrier(hold: str) -> None:
     """The barrier of a probed spherical shell, at its pressure or its volume, by thickness and Poisson's ratio."""
     file = CASES / "probing.yaml"

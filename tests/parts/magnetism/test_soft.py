@@ -206,7 +206,8 @@ def tip(ratio: float) -> tuple[float, float]:
     return float(x) - 1, float(z)
 
 
-@pytest.mark.parametrize("ratio", [1.2, pytest.param(2.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [1.2, 2.0])
 def test_a_strip_across_a_field_is_an_elastica(ratio: float) -> None:
     """B_c in closed form, tips at 1.2 and 2 B_c of Euler's elastica in twice the angle: 1e-4."""
     B_c = np.pi / 2 / 200 * np.sqrt(3 / 48)
